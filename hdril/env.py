@@ -1,0 +1,133 @@
+"""A bimanual task as a Gymnasium environment."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from hdril.conditions import ROBOT, failed
+from hdril.control import ACTION_NAMES, EndEffectorController, split_action
+from hdril.geometry import IDENTITY_QUATERNION
+from hdril.robots import ROBOTS
+from hdril.tasks import get_task
+from hdril.world import Physics, World
+
+SETTLE_PERIODS = 2
+
+
+class BimanualEnv(gym.Env):
+    """World x task x end-effector control, 10 actions a second.
+
+    Observation: ``agent_pos`` (16,), measured hand poses and openings; ``environment_state`` (7 per observed object).
+    Action (16,): commanded hand poses and openings, in the same order (:data:`hdril.control.ACTION_NAMES`); quaternions
+    are normalised, openings clipped to [0, 1]. Reward: 1 on success. ``info["is_success"]`` is judged from the task's
+    horizon on; the episode ends then with success, and at ``max_episode_steps`` (the horizon unless given) anyway.
+
+    Raises:
+        ValueError: unknown task, robot or render mode.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(
+        self,
+        task: str = "table_lift",
+        robot: str = "baxter",
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+        meshes: bool = False,
+        physics: Physics | None = None,
+    ) -> None:
+        if robot not in ROBOTS:
+            raise ValueError(f"unknown robot {robot!r}; choose from: {', '.join(ROBOTS)}")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"unknown render mode {render_mode!r}; choose from: rgb_array")
+        self.task_spec, self.robot_spec = get_task(task), ROBOTS[robot]
+        self.task, self.task_description = self.task_spec.name, self.task_spec.description
+        self.render_mode = render_mode
+        self._max_episode_steps = max_episode_steps or self.task_spec.horizon
+        self.world = World(physics)
+        self.controller = self._build(meshes)
+        high = np.full(7 * len(self.task_spec.observed), np.inf, np.float32)
+        self.observation_space = spaces.Dict(
+            {
+                "agent_pos": spaces.Box(-np.inf, np.inf, (len(ACTION_NAMES),), np.float32),
+                "environment_state": spaces.Box(-high, high, dtype=np.float32),
+            }
+        )
+        lows = [{"x": -2, "y": -2, "z": -2, "pos": 0}.get(name.split(".")[1], -1) for name in ACTION_NAMES]
+        highs = [{"x": 2, "y": 2, "z": 2}.get(name.split(".")[1], 1) for name in ACTION_NAMES]
+        self.action_space = spaces.Box(np.array(lows, np.float32), np.array(highs, np.float32))
+        self.frame = 0
+
+    def _build(self, meshes: bool) -> EndEffectorController:
+        world, robot, task = self.world, self.robot_spec, self.task_spec
+        world.add_urdf(ROBOT, robot.urdf(meshes), robot.base, self_collision=True)
+        world.ignore_collisions(ROBOT, robot.ignored_collisions(world.links(ROBOT)))
+        pads = [pad for arm in robot.arms.values() for pad in arm.gripper.pads]
+        world.set_link_dynamics(
+            ROBOT,
+            pads,
+            lateralFriction=robot.actuation.pad_friction,
+            spinningFriction=robot.actuation.pad_torsion,
+            frictionAnchor=1,
+        )
+        world.set_joint_velocity_limits(ROBOT, robot.actuation.velocities)
+        for i, body in enumerate(task.bodies):
+            # Out of everything's way: what is placed later leaves no trace in the solver's memory of contacts.
+            world.add_body(body, task.placements[body.name].sample(np.random.default_rng(0)).translated((0, 0, 10.0 * i)))
+        world.freeze()
+        return EndEffectorController(world, robot)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, NDArray[np.float32]], dict[str, Any]]:
+        """Put the objects where the seed says, the arms in their posture, and let everything come to rest."""
+        super().reset(seed=seed)
+        self.world.restore()
+        for body in self.task_spec.bodies:
+            self.world.place(body.name, self.task_spec.placements[body.name].sample(self.np_random))
+        self.controller.home()
+        self.controller.hold(SETTLE_PERIODS * self.world.physics.substeps)
+        self.frame = 0
+        return self._observe(), {"is_success": False}
+
+    def step(
+        self, action: NDArray[np.floating]
+    ) -> tuple[dict[str, NDArray[np.float32]], float, bool, bool, dict[str, Any]]:
+        """Run one control period towards ``action`` (16,).
+
+        Raises:
+            ValueError: the action has another shape or is not finite; names the entries.
+        """
+        self.controller.apply(split_action(action))
+        self.frame += 1
+        over = self.frame >= self.task_spec.horizon
+        missing = failed(self.task_spec.success, self.world) if over else ("the primitives are not over",)
+        success = not missing
+        info = {
+            "is_success": success,
+            "unmet": ", ".join(missing),
+            "ik_failure": "; ".join(f"{side}: {why}" for side, why in self.controller.failures.items()),
+        }
+        return self._observe(), float(success), success, not success and self.frame >= self._max_episode_steps, info
+
+    def _observe(self) -> dict[str, NDArray[np.float32]]:
+        objects = [
+            self.world.pose(name).aligned_to(IDENTITY_QUATERNION).as_vector() for name in self.task_spec.observed
+        ]
+        return {
+            "agent_pos": self.controller.observe().astype(np.float32),
+            "environment_state": np.concatenate(objects).astype(np.float32),
+        }
+
+    def render(self) -> NDArray[np.uint8]:
+        """(height, width, 3) RGB from the task's camera."""
+        return self.world.render(self.task_spec.camera)
+
+    def close(self) -> None:
+        self.world.close()

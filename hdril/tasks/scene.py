@@ -1,0 +1,10 @@
+"""What every scene has: the bench in front of the robot, its top at z = 0."""
+
+from hdril.tasks.task import fixed
+from hdril.world import BodySpec, Box
+
+BENCH_HEIGHT = 0.23
+BENCH = BodySpec(
+    "bench", (Box((1.10, 2.20, BENCH_HEIGHT), (0.0, 0.0, -BENCH_HEIGHT / 2), (0.86, 0.87, 0.88, 1.0)),), friction=0.5
+)
+BENCH_PLACEMENT = fixed((0.82, 0.0, 0.0))

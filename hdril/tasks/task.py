@@ -1,0 +1,71 @@
+"""What a task is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hdril.conditions import Condition
+from hdril.geometry import Pose
+from hdril.primitives import Primitive
+from hdril.world import BodySpec, Camera
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """A placement: the body's origin is uniform between two corners (m), its axes those of the world."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    def sample(self, rng: np.random.Generator) -> Pose:
+        return Pose(rng.uniform(self.low, self.high))
+
+
+@dataclass(frozen=True)
+class Task:
+    """A scene, the primitives that solve it, and what counts as success, as data.
+
+    ``bodies`` stand at ``placements[name]`` when an episode starts; those in ``observed`` are in the observation, in
+    this order. Success is judged from frame ``horizon`` on, when the primitives are over.
+    """
+
+    name: str
+    gym_id: str
+    description: str
+    """The instruction, in words: LeRobot's ``task``."""
+    bodies: tuple[BodySpec, ...]
+    placements: dict[str, Uniform]
+    observed: tuple[str, ...]
+    primitives: tuple[Primitive, ...]
+    success: tuple[Condition, ...]
+    camera: Camera = Camera()
+
+    def __post_init__(self) -> None:
+        names = [body.name for body in self.bodies]
+        for name in (*self.placements, *self.observed):
+            if name not in names:
+                raise ValueError(f"task {self.name}: no body {name!r}; bodies: {', '.join(names)}")
+        if missing := set(names) - set(self.placements):
+            raise ValueError(f"task {self.name}: no placement for {', '.join(sorted(missing))}")
+
+    @property
+    def horizon(self) -> int:
+        """Frames of one demonstration."""
+        return sum(primitive.frames for primitive in self.primitives)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the primitives, each once, in the order of their first use: a label is an index into this."""
+        return tuple(dict.fromkeys(primitive.name for primitive in self.primitives))
+
+    def find(self, name: str) -> BodySpec:
+        return next(body for body in self.bodies if body.name == name)
+
+
+def fixed(position: Sequence[float]) -> Uniform:
+    """A placement that does not vary."""
+    x, y, z = position
+    return Uniform((x, y, z), (x, y, z))
