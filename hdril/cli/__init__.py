@@ -1,0 +1,1 @@
+"""Commands. Each parses its options with draccus, as LeRobot's own commands do."""
