@@ -1,0 +1,179 @@
+"""Configuration of HDR-IL. Every variant of the paper (Section 5.1) is a value of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.configs.types import FeatureType, NormalizationMode
+from lerobot.optim.optimizers import AdamWConfig
+from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+
+from lerobot_policy_hdril.graph import feature_names
+
+Interaction = Literal["none", "scalar", "object"]
+Decoder = Literal["gru", "ode"]
+Rollout = Literal["closed_loop", "open_loop"]
+
+
+def _check_choice(name: str, value: str, choices: Any) -> None:
+    if value not in get_args(choices):
+        raise ValueError(f"policy.{name} must be one of {', '.join(get_args(choices))}; got {value!r}")
+
+
+@PreTrainedConfig.register_subclass("hdril")
+@dataclass
+class HDRILConfig(PreTrainedConfig):
+    """HDR-IL: a planner over primitives, and a graph-recurrent dynamics model for each (paper, Sections 4.1 to 4.3).
+
+    The paper's models are values: GRU-GRU is ``interaction=none skip=false per_primitive=false``; Res adds ``skip``;
+    Int adds ``interaction=scalar``; the Multi models and HDR-IL add ``per_primitive``.
+    """
+
+    # Variant.
+    interaction: Interaction = "object"
+    """Graph attention: ``none``; ``scalar``, the paper's node per number of the state; ``object``, a node per object."""
+    skip: bool = True
+    """The objects' state skips the encoder and joins its last hidden state (the paper's Res)."""
+    state_skip: bool = True
+    """A linear map from the state to every step of the prediction, beside the network (ours)."""
+    per_primitive: bool = True
+    """One dynamics model per primitive (the paper's Multi), or one for all that is told the primitive."""
+    decoder: Decoder = "gru"
+
+    # Rollout.
+    rollout: Rollout = "closed_loop"
+    """``closed_loop`` looks again at every re-plan; ``open_loop`` chains predictions from the first state (the paper)."""
+    replan_every: int = 0
+    """Look again every so many frames within a primitive as well; 0: at its start alone."""
+
+    # Sizes.
+    hidden_dim: int = 256
+    node_dim: int = 64
+    planner_hidden_dim: int = 128
+    planner_batch_size: int = 8
+    """Whole episodes per step that train the planner. It learns in a fraction of the steps that the dynamics need."""
+
+    # Losses.
+    state_loss_weight: float = 0.5
+    """Weight of the predicted states beside that of the actions."""
+    min_std: float = 0.01
+    """Floor of the deviations that normalise the data, m or dimensionless: what hardly moves must not dominate."""
+
+    # Optimisation.
+    optimizer_lr: float = 1e-3
+    optimizer_lr_state_skip: float = 1e-2
+    """The linear maps start at 0 and must reach 1; at the network's rate Adam would take a thousand steps for that."""
+    optimizer_weight_decay: float = 1e-4
+    optimizer_grad_clip_norm: float = 1.0
+    scheduler_warmup_share: float = 0.03
+    scheduler_final_lr: float = 1e-6
+
+    # Learned from the dataset; part of the checkpoint.
+    subtask_key: str = "subtask_index"
+    """Column of the dataset that labels each frame with its primitive."""
+    primitives: list[str] = field(default_factory=list)
+    primitive_lengths: list[list[int]] = field(default_factory=list)
+    """Shortest and longest run of each primitive, frames."""
+    state_names: list[str] = field(default_factory=list)
+    environment_names: list[str] = field(default_factory=list)
+    action_names: list[str] = field(default_factory=list)
+
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        # The model normalises by itself: it trains on trajectories that never pass through the processors.
+        default_factory=lambda: {
+            "STATE": NormalizationMode.IDENTITY,
+            "ENV": NormalizationMode.IDENTITY,
+            "ACTION": NormalizationMode.IDENTITY,
+        }
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_choice("interaction", self.interaction, Interaction)
+        _check_choice("decoder", self.decoder, Decoder)
+        _check_choice("rollout", self.rollout, Rollout)
+        for name in ("hidden_dim", "node_dim", "planner_hidden_dim", "planner_batch_size"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"policy.{name} must be at least 1, got {getattr(self, name)}")
+        if self.replan_every < 0:
+            raise ValueError(f"policy.replan_every must be 0 (never) or more frames, got {self.replan_every}")
+
+    def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
+        """Learn what each number of state and action is called. LeRobot calls this when it trains.
+
+        Raises:
+            ValueError: the dataset has no labels, or lacks a feature, or is not the one that the checkpoint learned.
+        """
+        if self.subtask_key not in features:
+            raise ValueError(
+                f"the dataset has no column {self.subtask_key!r} that labels its frames with primitives; "
+                f"its columns: {', '.join(features)}"
+            )
+        for key in (OBS_STATE, OBS_ENV_STATE, ACTION):
+            if key not in features:
+                raise ValueError(f"hdril needs {key!r}; the dataset has: {', '.join(features)}")
+        self._learn("state_names", feature_names(OBS_STATE, features[OBS_STATE]))
+        self._learn("environment_names", feature_names(OBS_ENV_STATE, features[OBS_ENV_STATE]))
+        self._learn("action_names", feature_names(ACTION, features[ACTION]))
+
+    def learn_primitives(self, primitives: list[str], lengths: list[list[int]]) -> None:
+        """Keep the dataset's primitives and their lengths.
+
+        Raises:
+            ValueError: the checkpoint knows other primitives: the dataset is of another task.
+        """
+        self._learn("primitives", primitives)
+        if not self.primitive_lengths:
+            self.primitive_lengths = lengths
+
+    def _learn(self, name: str, value: list[str]) -> None:
+        known = getattr(self, name)
+        if known and known != value:
+            raise ValueError(
+                f"the checkpoint was trained on another task: its {name} are {', '.join(known)}; "
+                f"the dataset's are {', '.join(value)}"
+            )
+        setattr(self, name, value)
+
+    def validate_features(self) -> None:
+        """Raises ValueError unless state, objects and actions are there, as vectors."""
+        for key, kind in ((OBS_STATE, FeatureType.STATE), (OBS_ENV_STATE, FeatureType.ENV)):
+            feature = (self.input_features or {}).get(key)
+            if feature is None or feature.type is not kind or len(feature.shape) != 1:
+                raise ValueError(f"hdril needs {key!r} as a vector; inputs: {', '.join(self.input_features or {})}")
+        if self.action_feature is None:
+            raise ValueError(f"hdril needs {ACTION!r}; outputs: {', '.join(self.output_features or {})}")
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        return AdamWConfig(
+            lr=self.optimizer_lr,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+        # LeRobot shrinks a longer schedule to the steps of the run: any run decays to its end.
+        steps = 1_000_000
+        return CosineDecayWithWarmupSchedulerConfig(
+            num_warmup_steps=int(steps * self.scheduler_warmup_share),
+            num_decay_steps=steps,
+            peak_lr=self.optimizer_lr,
+            decay_lr=self.scheduler_final_lr,
+        )
+
+    # The loader yields single frames, and the policy looks up the rest of each trajectory in memory: windows through
+    # the loader are 50 times slower (see demonstrations.py).
+    @property
+    def observation_delta_indices(self) -> None:
+        return None
+
+    @property
+    def action_delta_indices(self) -> None:
+        return None
+
+    @property
+    def reward_delta_indices(self) -> None:
+        return None

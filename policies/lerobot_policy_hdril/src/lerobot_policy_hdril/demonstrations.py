@@ -1,0 +1,162 @@
+"""The dataset's low-dimensional columns, held in memory, and windows of them by frame index.
+
+LeRobot's loader can cut windows itself, through delta timestamps, but at batch 70 it gives 70 to 540 of them a second;
+single frames come at thousands a second, and a gather from memory gives 90,000. So the loader yields single frames, of
+which the policy uses ``index`` alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as parquet
+import torch
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+SUBTASKS_PATH = "meta/subtasks.parquet"
+
+
+@dataclass(frozen=True)
+class Window:
+    """The rest of a primitive from a frame on, for B samples, padded to M frames.
+
+    ``state`` (B, S) is what is seen at the start; ``elapsed`` (B,) how many frames of the primitive are over by then;
+    ``target`` (B, M, A + S) the actions and the states that they lead to; ``mask`` (B, M) is True on real frames.
+    """
+
+    state: Tensor
+    primitive: Tensor  # (B,)
+    elapsed: Tensor
+    target: Tensor
+    mask: Tensor
+
+
+@dataclass(frozen=True)
+class History:
+    """Whole episodes for B samples, padded to T frames: states (B, T, S), labels (B, T), mask (B, T)."""
+
+    state: Tensor
+    primitive: Tensor
+    mask: Tensor
+
+
+def read_primitives(root: Path) -> list[str]:
+    """Names of the primitives in the order of their labels.
+
+    Raises:
+        ValueError: the dataset does not say what its labels mean.
+    """
+    path = root / SUBTASKS_PATH
+    if not path.exists():
+        raise ValueError(f"the dataset has no {SUBTASKS_PATH}: its primitives have no names")
+    table = pd.read_parquet(path).sort_values("subtask_index")
+    return [str(name) for name in (table["subtask"] if "subtask" in table else table.index)]
+
+
+def _matrix(table, key: str) -> np.ndarray:
+    return np.stack(table.column(key).to_numpy()).astype(np.float32)
+
+
+class Demonstrations:
+    """All frames of a dataset as tensors; ``state`` is observation.state and environment_state side by side.
+
+    Raises:
+        ValueError: labels that are not integers from 0 to the number of primitives - 1, or a primitive with no frames.
+    """
+
+    def __init__(self, metadata: LeRobotDatasetMetadata, subtask_key: str, device: str) -> None:
+        root = Path(metadata.root)
+        self.primitives = read_primitives(root)
+        columns = [OBS_STATE, OBS_ENV_STATE, ACTION, subtask_key, "index", "episode_index"]
+        files = sorted((root / "data").glob("*/*.parquet"))
+        if not files:
+            raise ValueError(f"{root} holds no data/*/*.parquet")
+        table = parquet.ParquetDataset(files).read(columns=columns)
+        table = table.take(np.argsort(table.column("index").to_numpy(), kind="stable"))
+        labels = table.column(subtask_key).to_numpy()
+        self._check_labels(labels)
+        episodes = table.column("episode_index").to_numpy()
+        new_episode = np.diff(episodes, prepend=-1) != 0
+        new_segment = new_episode | (np.diff(labels, prepend=-1) != 0)
+        tensors = {
+            "index": table.column("index").to_numpy().astype(np.int64),
+            "state": np.concatenate([_matrix(table, OBS_STATE), _matrix(table, OBS_ENV_STATE)], axis=1),
+            "action": _matrix(table, ACTION),
+            "label": labels.astype(np.int64),
+            "episode": np.cumsum(new_episode) - 1,
+            "segment": np.cumsum(new_segment) - 1,
+        }
+        if not all(np.isfinite(tensors[key]).all() for key in ("state", "action")):
+            raise ValueError(f"{root} holds states or actions that are not finite")
+        for name, value in tensors.items():
+            setattr(self, name, torch.from_numpy(value).to(device))
+        self._segment_bounds = self._bounds(new_segment, device)  # (segments, 2)
+        self._episode_bounds = self._bounds(new_episode, device)  # (episodes, 2)
+        self.lengths = self._lengths()
+        self.longest = max(longest for _, longest in self.lengths)
+
+    index: Tensor
+    state: Tensor
+    action: Tensor
+    label: Tensor
+    episode: Tensor
+    segment: Tensor
+
+    def _check_labels(self, labels: np.ndarray) -> None:
+        count = len(self.primitives)
+        if labels.min() < 0 or labels.max() >= count:
+            raise ValueError(
+                f"labels go from {labels.min()} to {labels.max()}, but {SUBTASKS_PATH} names {count}: {', '.join(self.primitives)}"
+            )
+        missing = [name for i, name in enumerate(self.primitives) if not (labels == i).any()]
+        if missing:
+            raise ValueError(f"no frame of the dataset is labelled {', '.join(missing)}; there is nothing to learn it from")
+
+    @staticmethod
+    def _bounds(starts: np.ndarray, device: str) -> Tensor:
+        first = np.flatnonzero(starts)
+        return torch.from_numpy(np.stack([first, np.append(first[1:], len(starts))], axis=1)).to(device)
+
+    def _lengths(self) -> list[list[int]]:
+        bounds = self._segment_bounds
+        lengths, labels = bounds[:, 1] - bounds[:, 0], self.label[bounds[:, 0]]
+        runs = [lengths[labels == k] for k in range(len(self.primitives))]
+        return [[int(run.min()), int(run.max())] for run in runs]
+
+    def rows(self, index: Tensor) -> Tensor:
+        """Rows of the frames with these values of ``index`` (B,)."""
+        rows = torch.searchsorted(self.index, index)
+        if rows.max() >= len(self.index) or not torch.equal(self.index[rows], index):
+            raise ValueError("the batch holds frames that the dataset on disk does not have")
+        return rows
+
+    def window(self, rows: Tensor, stride: int) -> Window:
+        """Windows that the frames belong to. They start where the rollout looks: every ``stride`` frames of a primitive,
+        or at its start alone if ``stride`` is 0."""
+        bounds = self._segment_bounds[self.segment[rows]]
+        first, end = bounds.unbind(-1)
+        elapsed = torch.div(rows - first, stride, rounding_mode="floor") * stride if stride else torch.zeros_like(rows)
+        start = first + elapsed
+        steps = start[:, None] + torch.arange(self.longest, device=rows.device)  # (B, M)
+        mask = steps < end[:, None]
+        steps = torch.minimum(steps, end[:, None] - 1)
+        # The last frame of an episode leads to a state that was not recorded: its own stands in.
+        last = self._episode_bounds[self.episode[rows], 1][:, None] - 1
+        target = torch.cat([self.action[steps], self.state[torch.minimum(steps + 1, last)]], dim=-1)
+        return Window(self.state[start], self.label[start], elapsed, target, mask)
+
+    def history(self, rows: Tensor) -> History:
+        """The whole episodes that the frames belong to."""
+        first, end = self._episode_bounds[self.episode[rows]].unbind(-1)
+        steps = first[:, None] + torch.arange(int((end - first).max()), device=rows.device)
+        mask = steps < end[:, None]
+        steps = torch.minimum(steps, end[:, None] - 1)
+        return History(self.state[steps], self.label[steps], mask)

@@ -1,0 +1,286 @@
+"""HDR-IL as a LeRobot policy: plan the next primitive, predict its trajectory, look again (paper, Section 4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lerobot_policy_hdril.configuration_hdril import HDRILConfig
+from lerobot_policy_hdril.demonstrations import Demonstrations, History, Window
+from lerobot_policy_hdril.dynamics import PrimitiveDynamics
+from lerobot_policy_hdril.graph import quaternion_groups
+from lerobot_policy_hdril.planner import Planner
+
+if TYPE_CHECKING:
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+
+@dataclass
+class Rollout:
+    """Where B running episodes are. ``plan`` (B, M, A + S) starts at frame ``plan_start`` (B,) of the primitive."""
+
+    primitive: Tensor  # (B,), -1 before the first
+    elapsed: Tensor  # (B,), frames of the primitive that are over
+    plan: Tensor
+    plan_start: Tensor
+    replanned: Tensor  # (B,), whether the last step made a new plan
+    probabilities: Tensor  # (B, K), of the last step
+    memory: Tensor | None = None
+
+    @staticmethod
+    def begin(batch: int, steps: int, width: int, primitives: int, device: torch.device) -> Rollout:
+        whole = torch.zeros(batch, dtype=torch.long, device=device)
+        return Rollout(
+            primitive=whole - 1,
+            elapsed=whole.clone(),
+            plan=torch.zeros(batch, steps, width, device=device),
+            plan_start=whole.clone(),
+            replanned=whole.bool(),
+            probabilities=torch.zeros(batch, primitives, device=device),
+        )
+
+
+class HDRILPolicy(PreTrainedPolicy):
+    """Hierarchical deep relational imitation learning.
+
+    A state s (S,) is ``observation.state`` and ``observation.environment_state`` side by side. At every frame the
+    planner turns s_0 … s_t into a distribution over primitives. When a primitive is over, the most probable one is next,
+    and its dynamics model predicts the actions that remain of it. A primitive is over after its longest recorded length,
+    or from its shortest on as soon as the planner prefers another; the planner may prefer the same one again.
+
+    Args:
+        config: see :class:`HDRILConfig`.
+        dataset_stats: statistics of the dataset (LeRobot gives them when it trains); needed for a new model.
+        dataset_meta: the dataset to train on, given likewise. Without it, :meth:`forward` cannot run.
+
+    Raises:
+        ValueError: no dataset and nothing learned before, or a dataset that does not fit.
+    """
+
+    config_class = HDRILConfig  # pyright: ignore
+    name = "hdril"  # pyright: ignore
+
+    def __init__(
+        self,
+        config: HDRILConfig,
+        dataset_stats: dict[str, dict[str, Any]] | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(config)
+        config.validate_features()
+        self.config: HDRILConfig = config
+        self._demonstrations: Demonstrations | None = None
+        if dataset_meta is not None:
+            config.set_dataset_feature_metadata(dataset_meta.features)
+            self._demonstrations = Demonstrations(dataset_meta, config.subtask_key, config.device or "cpu")
+            config.learn_primitives(self._demonstrations.primitives, self._demonstrations.lengths)
+        if not config.primitives:
+            raise ValueError("hdril learns its primitives from a dataset: train it with lerobot-train, or load a checkpoint")
+        self._build()
+        if dataset_stats is not None:
+            self._set_normalisation(dataset_stats)
+        self.reset()
+
+    def _build(self) -> None:
+        config = self.config
+        names = [*config.state_names, *config.environment_names]
+        state_dim, action_dim = len(names), len(config.action_names)
+        self.longest = max(longest for _, longest in config.primitive_lengths)
+        models = len(config.primitives) if config.per_primitive else 1
+        self.dynamics = nn.ModuleList(
+            PrimitiveDynamics(
+                names,
+                skip_columns=list(range(len(config.state_names), state_dim)) if config.skip else [],
+                context_dim=0 if config.per_primitive else len(config.primitives),
+                out_dim=action_dim + state_dim,
+                steps=self.longest,
+                interaction=config.interaction,
+                decoder=config.decoder,
+                hidden_dim=config.hidden_dim,
+                node_dim=config.node_dim,
+                state_skip=config.state_skip,
+            )
+            for _ in range(models)
+        )
+        self.planner = Planner(
+            names, len(config.primitives), config.interaction, config.planner_hidden_dim, config.node_dim
+        )
+        for key, size in (("state", state_dim), ("output", action_dim + state_dim)):
+            self.register_buffer(f"{key}_mean", torch.zeros(size))
+            self.register_buffer(f"{key}_std", torch.ones(size))
+        lengths = torch.tensor(config.primitive_lengths)
+        self.register_buffer("shortest_length", lengths[:, 0].contiguous(), persistent=False)
+        self.register_buffer("longest_length", lengths[:, 1].contiguous(), persistent=False)
+        self._quaternions = torch.tensor(quaternion_groups(config.action_names), dtype=torch.long)
+        weights = torch.cat([torch.ones(action_dim), torch.full((state_dim,), config.state_loss_weight)])
+        self.register_buffer("loss_weights", weights / weights.sum(), persistent=False)
+
+    state_mean: Tensor
+    state_std: Tensor
+    output_mean: Tensor
+    output_std: Tensor
+    shortest_length: Tensor
+    longest_length: Tensor
+    loss_weights: Tensor
+
+    def _set_normalisation(self, stats: dict[str, dict[str, Any]]) -> None:
+        def gather(keys: tuple[str, ...], statistic: str) -> Tensor:
+            missing = [key for key in keys if statistic not in stats.get(key, {})]
+            if missing:
+                raise ValueError(f"the dataset's stats have no {statistic} of {', '.join(missing)}")
+            return torch.cat([torch.as_tensor(stats[key][statistic], dtype=torch.float32).flatten() for key in keys])
+
+        state, output = (OBS_STATE, OBS_ENV_STATE), ("action", OBS_STATE, OBS_ENV_STATE)
+        for name, keys in (("state", state), ("output", output)):
+            getattr(self, f"{name}_mean").copy_(gather(keys, "mean"))
+            getattr(self, f"{name}_std").copy_(gather(keys, "std").clamp_min(self.config.min_std))
+
+    def get_optim_params(self) -> list[dict[str, Any]]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Two groups: the network, and the linear maps at a rate of their own."""
+        skips = [p for name, p in self.named_parameters() if ".state_skip." in name]
+        others = [p for name, p in self.named_parameters() if ".state_skip." not in name]
+        return [{"params": others}, {"params": skips, "lr": self.config.optimizer_lr_state_skip}]
+
+    # ------------------------------------------------------------------ training
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """Loss of the frames ``batch["index"]`` (B,), for the windows and episodes that they belong to.
+
+        Mean squared error of the normalised actions and states, plus cross-entropy of the planner at every frame of
+        ``planner_batch_size`` episodes. The two have no parameter in common: one run trains what the paper trains apart.
+
+        Raises:
+            RuntimeError: the policy was made without a dataset.
+            FloatingPointError: the loss is not finite.
+        """
+        if self._demonstrations is None:
+            raise RuntimeError("this policy was loaded without a dataset: train it with lerobot-train")
+        rows = self._demonstrations.rows(batch["index"].flatten())
+        dynamics_loss = self._dynamics_loss(self._demonstrations.window(rows, self.config.replan_every))
+        planner_loss, accuracy = self._planner_loss(self._demonstrations.history(rows[: self.config.planner_batch_size]))
+        loss = dynamics_loss + planner_loss
+        if not torch.isfinite(loss):
+            raise FloatingPointError(
+                f"the loss is not finite (dynamics {dynamics_loss.item()}, planner {planner_loss.item()}); "
+                "try a lower policy.optimizer_lr"
+            )
+        return loss, {
+            "dynamics_loss": dynamics_loss.item(),
+            "planner_loss": planner_loss.item(),
+            "planner_accuracy": accuracy,
+        }
+
+    def _dynamics_loss(self, window: Window) -> Tensor:
+        predicted = self._predict(window.state, window.primitive, window.elapsed)
+        target = (window.target - self.output_mean) / self.output_std
+        error = (predicted - target).square() @ self.loss_weights  # (B, M)
+        return (error * window.mask).sum() / window.mask.sum()
+
+    def _planner_loss(self, history: History) -> tuple[Tensor, float]:
+        logits, _ = self.planner(self._normalise(history.state), history.state)
+        loss = F.cross_entropy(logits[history.mask], history.primitive[history.mask])
+        hits = (logits.argmax(-1) == history.primitive)[history.mask]
+        return loss, hits.float().mean().item()
+
+    def _normalise(self, state: Tensor) -> Tensor:
+        return (state - self.state_mean) / self.state_std
+
+    def _predict(self, state: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
+        """Normalised actions and states (B, M, A + S) from raw states (B, S), ``elapsed`` (B,) frames into primitives."""
+        normalised = self._normalise(state)
+        steps = (elapsed[:, None] + torch.arange(self.longest, device=state.device)).clamp_max(self.longest - 1)
+        if not self.config.per_primitive:
+            context = F.one_hot(primitive, len(self.config.primitives)).to(state.dtype)
+            return self.dynamics[0](normalised, state, context, steps)
+        result = torch.empty(len(state), self.longest, len(self.loss_weights), device=state.device, dtype=state.dtype)
+        for k in primitive.unique().tolist():
+            mine = (primitive == k).nonzero().squeeze(-1)
+            context = state.new_zeros(len(mine), 0)
+            result = result.index_copy(0, mine, self.dynamics[k](normalised[mine], state[mine], context, steps[mine]))
+        return result
+
+    # ------------------------------------------------------------------ rollout
+
+    def reset(self) -> None:
+        """Forget the running episodes."""
+        self._rollout: Rollout | None = None
+
+    @property
+    def rollout(self) -> Rollout | None:
+        """Where the running episodes are: for viewers. None before the first action."""
+        return self._rollout
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """Look at a frame, and give the actions (B, M, A) from it to the end of the plan, which the last one pads.
+
+        Raises:
+            ValueError: an observation of another shape than the policy learned.
+        """
+        self.eval()
+        rollout = self._advance(self._state(batch))
+        ahead = (rollout.elapsed - rollout.plan_start)[:, None] + torch.arange(self.longest, device=rollout.plan.device)
+        chunk = rollout.plan[..., : len(self.config.action_names)]
+        index = ahead.clamp_max(self.longest - 1)[..., None].expand(-1, -1, chunk.shape[-1])
+        rollout.elapsed = rollout.elapsed + 1
+        return chunk.gather(1, index)
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """The action (B, A) for this frame. Raises as :meth:`predict_action_chunk`."""
+        return self.predict_action_chunk(batch)[:, 0]
+
+    def _state(self, batch: dict[str, Tensor]) -> Tensor:
+        parts = []
+        for key, names in ((OBS_STATE, self.config.state_names), (OBS_ENV_STATE, self.config.environment_names)):
+            if key not in batch or batch[key].shape[-1] != len(names):
+                shape = tuple(batch[key].shape) if key in batch else "nothing"
+                raise ValueError(
+                    f"the policy learned {key} as {len(names)} numbers ({', '.join(names)}), but was given {shape}; "
+                    "is the environment of another task?"
+                )
+            parts.append(batch[key].flatten(0, -2))
+        return torch.cat(parts, dim=-1)
+
+    def _advance(self, state: Tensor) -> Rollout:
+        """Update the planner, end and begin primitives, and make the plans that are due."""
+        config, rollout = self.config, self._rollout
+        if rollout is None or len(rollout.primitive) != len(state):
+            rollout = Rollout.begin(len(state), self.longest, len(self.loss_weights), len(config.primitives), state.device)
+            self._rollout = rollout
+        elif config.rollout == "open_loop":
+            # The state that the plan predicted for this frame, whatever is seen.
+            done = (rollout.elapsed - rollout.plan_start - 1)[:, None, None].expand(-1, 1, rollout.plan.shape[-1])
+            state = rollout.plan.gather(1, done).squeeze(1)[:, len(config.action_names) :]
+        logits, rollout.memory = self.planner(self._normalise(state)[:, None], state[:, None], rollout.memory)
+        rollout.probabilities = logits[:, 0].softmax(-1)
+        best = rollout.probabilities.argmax(-1)
+        current = rollout.primitive.clamp_min(0)
+        over = (rollout.primitive < 0) | (rollout.elapsed >= self.longest_length[current])
+        over |= (rollout.elapsed >= self.shortest_length[current]) & (best != rollout.primitive)
+        rollout.primitive = torch.where(over, best, rollout.primitive)
+        rollout.elapsed = torch.where(over, 0, rollout.elapsed)
+        rollout.replanned = over
+        if config.replan_every:
+            rollout.replanned = over | (rollout.elapsed % config.replan_every == 0)
+        if rollout.replanned.any():
+            due = rollout.replanned.nonzero().squeeze(-1)
+            predicted = self._predict(state[due], rollout.primitive[due], rollout.elapsed[due])
+            plan = predicted * self.output_std + self.output_mean
+            rollout.plan[due] = self._unit_quaternions(plan)
+            rollout.plan_start = torch.where(rollout.replanned, rollout.elapsed, rollout.plan_start)
+        return rollout
+
+    def _unit_quaternions(self, plan: Tensor) -> Tensor:
+        if len(self._quaternions) == 0:
+            return plan
+        plan = plan.clone()
+        plan[..., self._quaternions] = F.normalize(plan[..., self._quaternions], dim=-1)
+        return plan
