@@ -64,6 +64,12 @@ class BimanualEnv(gym.Env):
         self.action_space = spaces.Box(np.array(lows, np.float32), np.array(highs, np.float32))
         self.frame = 0
 
+    @property
+    def joint_names(self) -> list[str]:
+        """The joints that move: arms, then fingers, left before right."""
+        arms = self.robot_spec.arms.values()
+        return [joint for arm in arms for joint in arm.joints] + [j for arm in arms for j in arm.gripper.joints]
+
     def _build(self, meshes: bool) -> EndEffectorController:
         world, robot, task = self.world, self.robot_spec, self.task_spec
         world.add_urdf(ROBOT, robot.urdf(meshes), robot.base, self_collision=True)

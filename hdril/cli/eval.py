@@ -1,0 +1,145 @@
+"""hdril-eval: any LeRobot policy on held-out seeds, compared with the expert."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from contextlib import closing
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from tqdm import tqdm
+
+from hdril.cli.common import run
+from hdril.evaluation import Job, Outcome, check_held_out, evaluate, training_provenance
+from hdril.report import Run, headline, write_report
+from hdril.tasks import get_task
+
+
+@dataclass
+class PolicySource:
+    """Which policy. Any other --policy.… option overrides its config, e.g. --policy.rollout=open_loop."""
+
+    path: str
+    """Checkpoint: a folder (…/checkpoints/last/pretrained_model) or a Hub repository."""
+    device: str = "cpu"
+    """Device of the policy in every worker."""
+
+
+@dataclass
+class EvalConfig:
+    """Evaluate a LeRobot policy on held-out seeds: success with its 95 % interval, errors against the expert's
+    demonstration of the same seed, a report, and Rerun recordings.
+
+    After Ctrl-C, the same command goes on where it was.
+    """
+
+    policy: PolicySource
+    task: str = "table_lift"
+    """Task: table_lift."""
+    num_episodes: int = 100
+    """Episodes, one a seed."""
+    seed: int = 100_000
+    """First seed. Must not overlap the seeds that the policy was trained on."""
+    rerun: str = "failures"
+    """Episodes to keep as Rerun recordings: failures, all, none, or a number of episodes from the first on."""
+    output_dir: Path | None = None
+    """Folder of the results; must not exist. Default: outputs/eval/<task>_<time>."""
+    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
+    """Processes. The outcomes are the same for any number."""
+
+
+def _check(config: EvalConfig) -> None:
+    get_task(config.task)
+    for name, least in (("num_episodes", 1), ("seed", 0), ("workers", 1)):
+        if getattr(config, name) < least:
+            raise ValueError(f"{name} must be at least {least}, got {getattr(config, name)}")
+    if config.rerun not in ("failures", "all", "none") and not config.rerun.isdigit():
+        raise ValueError(f"rerun must be failures, all, none or a number, got {config.rerun!r}")
+    path = Path(config.policy.path)
+    looks_local = path.is_absolute() or path.parts[:1] in ((".",), ("..",)) or len(path.parts) != 2
+    if not (path / "config.json").exists() and (looks_local or path.exists()):
+        raise FileNotFoundError(f"no checkpoint at {path}: it should be a folder with config.json and model.safetensors")
+
+
+def eval_command(config: EvalConfig, overrides: tuple[str, ...] = ()) -> None:
+    _check(config)
+    output = config.output_dir or Path("outputs/eval") / f"{config.task}_{time.strftime('%Y-%m-%d_%H-%M-%S')}"
+    if output.exists():
+        raise FileExistsError(f"{output} exists; choose another output_dir or delete it")
+    seeds = list(range(config.seed, config.seed + config.num_episodes))
+    held_out = check_held_out(training_provenance(config.policy.path), config.task, seeds)
+    if not held_out:
+        print(f"Note: the training data of {config.policy.path} are not at hand; whether these seeds were in them is not known.")
+    what = Run(config.task, config.policy.path, overrides, config.seed, config.num_episodes, held_out)
+    partial = output.with_name(output.name + ".partial")
+    done = _resume(partial, what)
+    job = Job(
+        config.task, config.policy.path, overrides, config.policy.device, partial / "rerun", config.rerun, config.seed
+    )
+    start = time.monotonic()
+    outcomes = [done[seed] for seed in seeds if seed in done]
+    left = [seed for seed in seeds if seed not in done]
+    with (
+        (partial / "outcomes.jsonl").open("a") as journal,
+        tqdm(total=len(seeds), initial=len(outcomes), desc=f"evaluating {config.task}", unit="episode") as bar,
+        closing(evaluate(job, left, min(config.workers, max(len(left), 1)))) as stream,
+    ):
+        for outcome in stream:
+            journal.write(json.dumps(asdict(outcome)) + "\n")
+            journal.flush()
+            outcomes.append(outcome)
+            bar.set_postfix(success=f"{100 * sum(o.success for o in outcomes) / len(outcomes):.1f}%", refresh=False)
+            bar.update()
+    outcomes.sort(key=lambda outcome: outcome.seed)
+    summary = write_report(partial, what, outcomes)
+    (partial / "run.json").unlink()
+    (partial / "outcomes.jsonl").unlink()
+    output.parent.mkdir(parents=True, exist_ok=True)
+    partial.replace(output)
+    recordings = sorted((output / "rerun").glob("*.rrd")) if (output / "rerun").exists() else []
+    print(f"{headline(summary)}; {time.monotonic() - start:.0f} s")
+    print(f"Report: {output / 'report.md'}")
+    if recordings:
+        print(f"{len(recordings)} recordings: rerun {recordings[0]}")
+
+
+def _resume(partial: Path, what: Run) -> dict[int, Outcome]:
+    """Outcomes of an interrupted evaluation of the same thing.
+
+    Raises:
+        ValueError: the folder holds a different one.
+    """
+    plan, journal = partial / "run.json", partial / "outcomes.jsonl"
+    text = json.dumps(asdict(what))
+    if plan.exists() and plan.read_text() != text:
+        raise ValueError(f"{partial} holds another unfinished evaluation; delete it or choose another output_dir")
+    partial.mkdir(parents=True, exist_ok=True)
+    plan.write_text(text)
+    outcomes: dict[int, Outcome] = {}
+    if journal.exists():
+        for line in journal.read_text().splitlines():
+            values = json.loads(line)
+            outcomes[values["seed"]] = Outcome(
+                **values | {"start": tuple(values["start"]), "primitives": tuple(values["primitives"])}
+            )
+    return outcomes
+
+
+def split_overrides(arguments: list[str]) -> tuple[list[str], tuple[str, ...]]:
+    """Options of this command, and those that belong to the policy's own config (with ``--policy.`` cut off)."""
+    ours = ("--policy.path", "--policy.device")
+    theirs = [a for a in arguments if a.startswith("--policy.") and a.split("=")[0] not in ours]
+    return [a for a in arguments if a not in theirs], tuple("--" + a.removeprefix("--policy.") for a in theirs)
+
+
+def main() -> None:
+    """Entry point."""
+    sys.argv[1:], overrides = split_overrides(sys.argv[1:])
+    run("hdril-eval", EvalConfig, lambda config: eval_command(config, overrides))
+
+
+if __name__ == "__main__":
+    main()

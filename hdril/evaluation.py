@@ -1,0 +1,288 @@
+"""Any LeRobot policy on paired, held-out seeds: the scene of a seed is the same for every policy and for the expert."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hdril.conditions import ROBOT
+from hdril.demonstrator import Demonstrator, Observation
+from hdril.env import BimanualEnv
+from hdril.metrics import trajectory_error
+from hdril.primitives import Noise
+from hdril.recording import Provenance, read_provenance
+from hdril.tasks import Task
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Everything that a viewer wants of one episode of T frames. States have T + 1 rows: the last is after the end."""
+
+    state: NDArray[np.float32]  # (T + 1, 16)
+    environment_state: NDArray[np.float32]  # (T + 1, 7 per object)
+    action: NDArray[np.float32]  # (T, 16)
+    joints: NDArray[np.float64]  # (T + 1, joints of the robot)
+    reward: NDArray[np.float32]  # (T,)
+    scripted: NDArray[np.int64]  # (T,), label of the expert; -1 past its end
+    predicted: NDArray[np.int64]  # (T,), label that the policy plays; -1 if it has none
+    ik_failures: tuple[str, ...]  # (T,), empty strings where there was none
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How one episode went. Errors are against the noise-free expert on the same seed: cm, rad, cm."""
+
+    seed: int
+    success: bool
+    unmet: str
+    frames: int
+    ik_failures: int
+    position_error_cm: float
+    angle_error_rad: float
+    dtw_cm: float
+    position_error_cm_by_primitive: dict[str, float]
+    start: tuple[float, ...]
+    """x and y of every observed object at the start, m."""
+    primitives: tuple[str, ...] = ()
+    """What the policy played, in order; empty if it has no primitives."""
+
+
+Act = Callable[[Observation], tuple[NDArray[np.float32], int]]
+"""A policy as the evaluation sees it: observation to action (16,) and the label of the primitive it plays, or -1."""
+
+
+class LeRobotActor:
+    """A LeRobot checkpoint, with its processors, acting on one environment.
+
+    Raises:
+        FileNotFoundError: there is no such checkpoint.
+        ValueError: the checkpoint does not fit the environment.
+    """
+
+    def __init__(self, path: str, task: Task, overrides: tuple[str, ...] = (), device: str = "cpu") -> None:
+        import torch
+        from lerobot.configs.policies import PreTrainedConfig
+        from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+
+        # Registers the policy types of lerobot_policy_* distributions.
+        from lerobot.utils.import_utils import register_third_party_plugins
+
+        register_third_party_plugins()
+        torch.set_num_threads(1)
+        config = PreTrainedConfig.from_pretrained(path, cli_overrides=[*overrides, f"--device={device}"])
+        self.policy = get_policy_class(config.type).from_pretrained(path, config=config)
+        self._before, self._after = make_pre_post_processors(
+            config, pretrained_path=path, preprocessor_overrides={"device_processor": {"device": device}}
+        )
+        self._torch = torch
+        self._description = task.description
+        known = {name: label for label, name in enumerate(task.labels)}
+        self._labels = [known.get(name, -1) for name in getattr(config, "primitives", [])]
+
+    def reset(self, seed: int) -> None:
+        """Begin an episode; a policy that samples draws the same numbers for the same seed."""
+        self._torch.manual_seed(seed)
+        self.policy.reset()
+
+    def act(self, observation: Observation) -> tuple[NDArray[np.float32], int]:
+        """The action (16,) for an observation, and the task's label of the primitive that the policy plays, or -1."""
+        from lerobot.envs.utils import preprocess_observation
+
+        batch: dict[str, Any] = preprocess_observation(dict(observation))
+        batch["task"] = [self._description]
+        with self._torch.inference_mode():
+            action = self._after(self.policy.select_action(self._before(batch)))
+        rollout = getattr(self.policy, "rollout", None)
+        label = self._labels[int(rollout.primitive[0])] if rollout is not None else -1
+        return action[0].numpy().astype(np.float32), label
+
+
+def run_episode(env: BimanualEnv, act: Act, seed: int, labels: NDArray[np.int64]) -> tuple[Trace, bool, str]:
+    """Play the scene of ``seed``; ``labels`` are the expert's."""
+    observation, _ = env.reset(seed=seed)
+    joints = env.world.joint_indices(ROBOT, env.joint_names)
+    observations, positions = [observation], [env.world.joint_positions(ROBOT, joints)]
+    actions, rewards, predicted, failures = [], [], [], []
+    done, info = False, {}
+    while not done:
+        action, label = act(observation)
+        observation, reward, terminated, truncated, info = env.step(action)
+        done = terminated or truncated
+        observations.append(observation)
+        positions.append(env.world.joint_positions(ROBOT, joints))
+        actions.append(action)
+        rewards.append(reward)
+        predicted.append(label)
+        failures.append(info["ik_failure"])
+    scripted = np.full(len(actions), -1)
+    scripted[: len(labels)] = labels[: len(actions)]
+    trace = Trace(
+        state=np.stack([o["agent_pos"] for o in observations]),
+        environment_state=np.stack([o["environment_state"] for o in observations]),
+        action=np.stack(actions).astype(np.float32),
+        joints=np.stack(positions),
+        reward=np.array(rewards, np.float32),
+        scripted=scripted,
+        predicted=np.array(predicted),
+        ik_failures=tuple(failures),
+    )
+    return trace, bool(info["is_success"]), str(info["unmet"])
+
+
+def demonstrate_trace(env: BimanualEnv, expert: Demonstrator, seed: int) -> Trace:
+    """The expert's episode of this seed, as a trace."""
+    expert.reset(seed)
+    labels = np.repeat(
+        [env.task_spec.labels.index(p.name) for p in env.task_spec.primitives],
+        [p.frames for p in env.task_spec.primitives],
+    )
+
+    def act(observation: Observation) -> tuple[NDArray[np.float32], int]:
+        step = expert.act(observation)
+        return step.action.astype(np.float32), step.label
+
+    return run_episode(env, act, seed, labels)[0]
+
+
+def judge(task: Task, seed: int, trace: Trace, reference: Trace, success: bool, unmet: str) -> Outcome:
+    """Compare an episode with the expert's."""
+    error = trajectory_error(trace.state, reference.state)
+    names = np.array(task.labels)
+    # Row i + 1 is where the action of frame i led.
+    labels = reference.scripted[: len(error.position) - 1]
+    by_primitive = {
+        str(name): 100.0 * float(error.position[1:][labels == k].mean())
+        for k, name in enumerate(names)
+        if (labels == k).any()
+    }
+    changes = np.flatnonzero(np.diff(trace.predicted, prepend=-2))
+    played = tuple(str(names[trace.predicted[i]]) for i in changes if 0 <= trace.predicted[i] < len(names))
+    start = trace.environment_state[0].reshape(-1, 7)[:, :2]
+    return Outcome(
+        seed=seed,
+        success=success,
+        unmet=unmet,
+        frames=len(trace.action),
+        ik_failures=sum(bool(failure) for failure in trace.ik_failures),
+        position_error_cm=100.0 * float(error.position.mean()),
+        angle_error_rad=float(error.angle.mean()),
+        dtw_cm=100.0 * error.dtw,
+        position_error_cm_by_primitive=by_primitive,
+        start=tuple(round(float(v), 4) for v in start.ravel()),
+        primitives=played,
+    )
+
+
+@dataclass(frozen=True)
+class Job:
+    """What a worker needs. ``recordings`` is the folder for Rerun files; ``keep`` says which episodes get one."""
+
+    task: str
+    policy: str
+    overrides: tuple[str, ...] = ()
+    device: str = "cpu"
+    recordings: Path | None = None
+    keep: str = "none"
+    """``none``, ``failures``, ``all``, or the number of episodes to keep from ``first_seed`` on."""
+    first_seed: int = 0
+
+
+@dataclass
+class Worker:
+    """One process: an environment, the expert, and the policy."""
+
+    job: Job
+    env: BimanualEnv = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.env = BimanualEnv(self.job.task)
+        self._expert = Demonstrator(self.env.task_spec, Noise(0.0))
+        self._actor = LeRobotActor(self.job.policy, self.env.task_spec, self.job.overrides, self.job.device)
+
+    def run(self, seed: int) -> Outcome:
+        """Expert and policy on the scene of ``seed``; writes the Rerun file if the episode is to be kept."""
+        task = self.env.task_spec
+        reference = demonstrate_trace(self.env, self._expert, seed)
+        self._actor.reset(seed)
+        trace, success, unmet = run_episode(self.env, self._actor.act, seed, reference.scripted)
+        outcome = judge(task, seed, trace, reference, success, unmet)
+        if self._keeps(outcome):
+            from hdril.rerun_log import write_recording
+
+            write_recording(self.job.recordings, self.env, outcome, trace, reference)  # pyright: ignore
+        return outcome
+
+    def _keeps(self, outcome: Outcome) -> bool:
+        keep = self.job.keep
+        if self.job.recordings is None or keep == "none":
+            return False
+        if keep in ("all", "failures"):
+            return keep == "all" or not outcome.success
+        return outcome.seed < self.job.first_seed + int(keep)
+
+
+_workers: dict[Job, Worker] = {}
+
+
+def _work(job: Job, seed: int) -> Outcome:
+    # Built by the first call and not by the pool's initializer, whose errors reach nobody.
+    if job not in _workers:
+        _workers[job] = Worker(job)
+    return _workers[job].run(seed)
+
+
+def evaluate(job: Job, seeds: list[int], workers: int = 1) -> Iterator[Outcome]:
+    """Outcomes in the order of ``seeds``, the same for any number of workers: each plays one episode at a time."""
+    if workers == 1:
+        worker = Worker(job)
+        with closing(worker.env):
+            yield from map(worker.run, seeds)
+        return
+    pool = ProcessPoolExecutor(workers, get_context("forkserver"))
+    try:
+        futures: list[Future[Outcome]] = [pool.submit(_work, job, seed) for seed in seeds]
+        for future in futures:
+            yield future.result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def training_provenance(policy: str) -> Provenance | None:
+    """How the data were made that a checkpoint was trained on; None if that cannot be told from here."""
+    path = Path(policy) / "train_config.json"
+    if not path.exists():
+        return None
+    dataset = json.loads(path.read_text()).get("dataset") or {}
+    root = dataset.get("root")
+    if root is None and dataset.get("repo_id"):
+        from lerobot.utils.constants import HF_LEROBOT_HOME
+
+        root = HF_LEROBOT_HOME / dataset["repo_id"]
+    return read_provenance(Path(root)) if root else None
+
+
+def check_held_out(provenance: Provenance | None, task: str, seeds: list[int]) -> bool:
+    """Whether the seeds are known to be held out: False if there is no telling.
+
+    Raises:
+        ValueError: the policy was trained on some of the seeds, or on another task.
+    """
+    if provenance is None:
+        return False
+    if provenance.recipe.task != task:
+        raise ValueError(f"the policy was trained on the task {provenance.recipe.task!r}, not on {task!r}")
+    if shared := set(seeds) & set(provenance.seeds):
+        raise ValueError(
+            f"{len(shared)} of {len(seeds)} seeds ({min(shared)} to {max(shared)}) were in the training data, which are seeds "
+            f"{min(provenance.seeds)} to {max(provenance.seeds)}; choose a seed above {max(provenance.seeds)}"
+        )
+    return True
