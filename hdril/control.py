@@ -121,7 +121,9 @@ def check_action(action: NDArray[np.floating]) -> NDArray[np.float64]:
     """
     array = np.asarray(action, dtype=np.float64)
     if array.shape != (len(ACTION_NAMES),):
-        raise ValueError(f"an action has {len(ACTION_NAMES)} numbers ({ACTION_NAMES[0]} … {ACTION_NAMES[-1]}), got shape {array.shape}")
+        raise ValueError(
+            f"an action has {len(ACTION_NAMES)} numbers, {ACTION_NAMES[0]} to {ACTION_NAMES[-1]}; got shape {array.shape}"
+        )
     if not np.isfinite(array).all():
         bad = [f"{name} = {value}" for name, value in zip(ACTION_NAMES, array, strict=True) if not np.isfinite(value)]
         raise ValueError(f"the action is not finite: {', '.join(bad)}")
@@ -203,14 +205,14 @@ class EndEffectorController:
         """Run one control period towards ``commands``."""
         for side, command in commands.items():
             target = self._base_inverse @ command.pose
-            result = solve_ik(
-                self._chains[side], target, self._arm_targets[side], self._posture[side], self.settings
-            )
+            result = solve_ik(self._chains[side], target, self._arm_targets[side], self._posture[side], self.settings)
             self.results[side] = result
             if result.ok:
                 # All joints are slowed alike, so that the hand lags on its path instead of leaving it.
                 step = result.joints - self._arm_targets[side]
-                self._arm_targets[side] = self._arm_targets[side] + step / max(1.0, np.abs(step / self._reach[side]).max())
+                self._arm_targets[side] = self._arm_targets[side] + step / max(
+                    1.0, np.abs(step / self._reach[side]).max()
+                )
         goal = self._joint_targets({side: command.opening for side, command in commands.items()})
         arms = len(goal) - sum(len(fingers) for fingers in self._fingers.values())
         substeps = self._world.physics.substeps

@@ -31,7 +31,7 @@ class BimanualEnv(gym.Env):
         ValueError: unknown task, robot or render mode.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}  # pyright: ignore
 
     def __init__(
         self,
@@ -85,7 +85,9 @@ class BimanualEnv(gym.Env):
         world.set_joint_velocity_limits(ROBOT, robot.actuation.velocities)
         for i, body in enumerate(task.bodies):
             # Out of everything's way: what is placed later leaves no trace in the solver's memory of contacts.
-            world.add_body(body, task.placements[body.name].sample(np.random.default_rng(0)).translated((0, 0, 10.0 * i)))
+            world.add_body(
+                body, task.placements[body.name].sample(np.random.default_rng(0)).translated((0, 0, 10.0 * i))
+            )
         world.freeze()
         return EndEffectorController(world, robot)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -240,7 +240,7 @@ def _work(job: Job, seed: int) -> Outcome:
     return _workers[job].run(seed)
 
 
-def evaluate(job: Job, seeds: list[int], workers: int = 1) -> Iterator[Outcome]:
+def evaluate(job: Job, seeds: list[int], workers: int = 1) -> Generator[Outcome]:
     """Outcomes in the order of ``seeds``, the same for any number of workers: each plays one episode at a time."""
     if workers == 1:
         worker = Worker(job)

@@ -7,7 +7,8 @@ takes 60 microseconds for each, a tenth of the whole simulation.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 IDENTITY_QUATERNION = (0.0, 0.0, 0.0, 1.0)
 POSE_AXES = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
-Quaternion = tuple[float, float, float, float]
+Quaternion = Sequence[float]
 
 
 def _vector(value: ArrayLike, size: int, what: str) -> NDArray[np.float64]:
@@ -26,7 +27,7 @@ def _vector(value: ArrayLike, size: int, what: str) -> NDArray[np.float64]:
     return array
 
 
-def _multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+def _multiply(a: Quaternion, b: Quaternion) -> tuple[float, float, float, float]:
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (
@@ -37,7 +38,7 @@ def _multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     )
 
 
-def _rotate(q: Quaternion, v: tuple[float, float, float]) -> tuple[float, float, float]:
+def _rotate(q: Quaternion, v: Sequence[float]) -> tuple[float, float, float]:
     """v + 2 w (u x v) + 2 u x (u x v) for q = (u, w)."""
     x, y, z, w = q
     vx, vy, vz = v
@@ -49,7 +50,7 @@ def _rotate(q: Quaternion, v: tuple[float, float, float]) -> tuple[float, float,
     )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Pose:
     """A rigid transform: a frame's position (3,) in m and its orientation (4,), xyzw, in a parent frame.
 
@@ -58,28 +59,28 @@ class Pose:
     """
 
     position: NDArray[np.float64]
-    quaternion: NDArray[np.float64] = field(default_factory=lambda: np.array(IDENTITY_QUATERNION))
+    quaternion: NDArray[np.float64]
 
-    def __post_init__(self) -> None:
-        quaternion = _vector(self.quaternion, 4, "a quaternion")
-        norm = math.sqrt(quaternion @ quaternion)
+    def __init__(self, position: ArrayLike, quaternion: ArrayLike = IDENTITY_QUATERNION) -> None:
+        unscaled = _vector(quaternion, 4, "a quaternion")
+        norm = math.sqrt(unscaled @ unscaled)
         if norm < 1e-6:
-            raise ValueError(f"a quaternion must not be zero, got {quaternion.tolist()}")
-        quaternion = quaternion / norm
-        quaternion.setflags(write=False)
-        object.__setattr__(self, "position", _vector(self.position, 3, "a position"))
-        object.__setattr__(self, "quaternion", quaternion)
+            raise ValueError(f"a quaternion must not be zero, got {unscaled.tolist()}")
+        unit = unscaled / norm
+        unit.setflags(write=False)
+        object.__setattr__(self, "position", _vector(position, 3, "a position"))
+        object.__setattr__(self, "quaternion", unit)
 
     def __matmul__(self, other: Pose) -> Pose:
         """Compose: ``world_T_a @ a_T_b`` is ``world_T_b``."""
         rotation = self.quaternion.tolist()
-        offset = _rotate(rotation, other.position.tolist())
-        return Pose(self.position + offset, _multiply(rotation, other.quaternion.tolist()))  # pyright: ignore
+        offset = np.array(_rotate(rotation, other.position.tolist()))
+        return Pose(self.position + offset, _multiply(rotation, other.quaternion.tolist()))
 
     def inverse(self) -> Pose:
         x, y, z, w = self.quaternion.tolist()
         conjugate = (-x, -y, -z, w)
-        return Pose(-np.array(_rotate(conjugate, self.position.tolist())), conjugate)  # pyright: ignore
+        return Pose(-np.array(_rotate(conjugate, self.position.tolist())), conjugate)
 
     def translated(self, offset: ArrayLike) -> Pose:
         """This pose moved by ``offset`` (3,), m, along the parent frame's axes."""
@@ -118,9 +119,9 @@ def interpolate(start: Pose, end: Pose, fraction: float) -> Pose:
     if half < 1e-6:  # the sine below would be divided by itself, both lost in rounding
         quaternion = (1.0 - fraction) * start.quaternion + fraction * goal
     else:
-        quaternion = (math.sin((1.0 - fraction) * half) * start.quaternion + math.sin(fraction * half) * goal) / math.sin(
-            half
-        )
+        quaternion = (
+            math.sin((1.0 - fraction) * half) * start.quaternion + math.sin(fraction * half) * goal
+        ) / math.sin(half)
     return Pose(position, quaternion)
 
 

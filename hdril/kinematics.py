@@ -65,9 +65,7 @@ class Chain:
         self.upper = np.array([joint.upper for joint in self.joints])
         self._offsets = np.stack([joint.offset for joint in self.joints])
 
-    def transform_and_jacobian(
-        self, q: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def transform_and_jacobian(self, q: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Tool transform (4, 4) and its geometric Jacobian (6, n), linear rows first, in the base link's frame.
 
         Column i is [z_i x (p - p_i); z_i] for joint axis z_i through p_i.
@@ -103,5 +101,7 @@ def _origin(joint: ElementTree.Element) -> NDArray[np.float64]:
     if origin is not None:
         transform[:3, 3] = [float(v) for v in origin.get("xyz", "0 0 0").split()]
         # URDF: fixed-axis roll, pitch, yaw.
-        transform[:3, :3] = Rotation.from_euler("xyz", [float(v) for v in origin.get("rpy", "0 0 0").split()]).as_matrix()
+        transform[:3, :3] = Rotation.from_euler(
+            "xyz", [float(v) for v in origin.get("rpy", "0 0 0").split()]
+        ).as_matrix()
     return transform

@@ -60,9 +60,7 @@ class HDRILEnvConfig(EnvConfig):
             "meshes": self.meshes,
         }
 
-    def create_envs(
-        self, n_envs: int, use_async_envs: bool = False
-    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """One vector environment, as LeRobot wants it.
 
         Workers of an asynchronous one get a factory of this module, so that they import it: a gym id alone would not

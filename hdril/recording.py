@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, field, replace
@@ -117,7 +117,7 @@ def _work(seed: int) -> Episode:
     return demonstrate(*_worker, seed)
 
 
-def episodes(recipe: Recipe, first_seed: int, workers: int = 1) -> Iterator[Episode]:
+def episodes(recipe: Recipe, first_seed: int, workers: int = 1) -> Generator[Episode]:
     """Demonstrations of seeds ``first_seed``, + 1, + 2, …, in this order whatever the number of workers, without end.
 
     Close the iterator when you have enough.
@@ -156,7 +156,7 @@ class _Shelf:
     def put(self, episode: Episode) -> None:
         part = self.folder / "part.tmp"
         with part.open("wb") as file:
-            np.savez(file, **{name: np.asarray(value) for name, value in vars(episode).items()})
+            np.savez(file, allow_pickle=False, **{name: np.asarray(value) for name, value in vars(episode).items()})
         part.replace(self.folder / f"{episode.seed}.npz")
 
     def take(self, first_seed: int) -> Iterator[Episode]:
@@ -218,7 +218,9 @@ def record(
         else:
             dropped[episode.seed] = episode.unmet
             if len(dropped) > 20 + len(kept):
-                raise RuntimeError(f"the expert failed on {len(dropped)} of {len(dropped) + len(kept)} seeds; last: {episode.unmet}")
+                raise RuntimeError(
+                    f"the expert failed on {len(dropped)} of {len(dropped) + len(kept)} seeds; last: {episode.unmet}"
+                )
         if progress:
             progress(len(kept), len(dropped))
 
@@ -273,10 +275,11 @@ def write_dataset(root: Path, repo_id: str, recipe: Recipe, kept: list[Episode],
     """
     import pandas as pd
     import pyarrow.parquet as parquet
-    from datasets import Dataset
     from lerobot.datasets.compute_stats import compute_episode_stats
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.feature_utils import get_hf_features_from_features
+
+    from datasets import Dataset
 
     task = get_task(recipe.task)
     metadata = LeRobotDatasetMetadata.create(
@@ -290,7 +293,7 @@ def write_dataset(root: Path, repo_id: str, recipe: Recipe, kept: list[Episode],
     writer, start = None, 0
     for index, episode in enumerate(kept):
         frames = _frames(episode, index, start, metadata.fps)
-        table = Dataset.from_dict(frames, features=columns).with_format("arrow")[:]
+        table: Any = Dataset.from_dict(frames, features=columns).with_format("arrow")[:]
         writer = writer or parquet.ParquetWriter(data_path, table.schema)
         writer.write_table(table)
         stats = compute_episode_stats({key: np.asarray(frames[key]) for key in metadata.features}, metadata.features)

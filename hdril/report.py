@@ -56,7 +56,9 @@ def summarise(run: Run, outcomes: list[Outcome]) -> dict[str, Any]:
         "angle_error_rad": spread([outcome.angle_error_rad for outcome in outcomes]),
         "dtw_cm": spread([outcome.dtw_cm for outcome in outcomes]),
         "position_error_cm_by_primitive": {
-            name: spread([o.position_error_cm_by_primitive[name] for o in outcomes if name in o.position_error_cm_by_primitive])
+            name: spread(
+                [o.position_error_cm_by_primitive[name] for o in outcomes if name in o.position_error_cm_by_primitive]
+            )
             for name in labels
         },
         "pc_expert_order": 100.0 * sum(o.primitives == script for o in planned) / len(planned) if planned else None,
@@ -85,7 +87,9 @@ def headline(summary: dict[str, Any]) -> str:
 
 
 def _markdown(run: Run, outcomes: list[Outcome], summary: dict[str, Any]) -> str:
-    held_out = "none of them in the training data" if run.held_out else "whether they were in the training data is not known"
+    held_out = (
+        "none of them in the training data" if run.held_out else "whether they were in the training data is not known"
+    )
 
     def spread(key: str, digits: int) -> str:
         return f"{summary[key]['mean']:.{digits}f} ± {summary[key]['std']:.{digits}f}"
@@ -107,15 +111,25 @@ def _markdown(run: Run, outcomes: list[Outcome], summary: dict[str, Any]) -> str
         "",
         "| " + " | ".join(summary["position_error_cm_by_primitive"]) + " |",
         "|" + "---|" * len(summary["position_error_cm_by_primitive"]),
-        "| " + " | ".join(f"{v['mean']:.2f} ± {v['std']:.2f} cm" for v in summary["position_error_cm_by_primitive"].values()) + " |",
+        "| "
+        + " | ".join(f"{v['mean']:.2f} ± {v['std']:.2f} cm" for v in summary["position_error_cm_by_primitive"].values())
+        + " |",
         "",
     ]
     if summary["pc_expert_order"] is not None:
-        lines += [f"The planner chose the expert's order of primitives in {summary['pc_expert_order']:.1f} % of episodes.", ""]
+        lines += [
+            f"The planner chose the expert's order of primitives in {summary['pc_expert_order']:.1f} % of episodes.",
+            "",
+        ]
     failures = [outcome for outcome in outcomes if not outcome.success]
     if failures:
         reasons = Counter(reason for outcome in failures for reason in outcome.unmet.split(", "))
-        lines += ["## Failures", "", "What did not hold: " + ", ".join(f"{reason} ({n})" for reason, n in reasons.most_common()) + ".", ""]
+        lines += [
+            "## Failures",
+            "",
+            "What did not hold: " + ", ".join(f"{reason} ({n})" for reason, n in reasons.most_common()) + ".",
+            "",
+        ]
         lines += ["| seed | not met | position error, cm | frames without inverse kinematics |", "|---|---|---|---|"]
         lines += [f"| {o.seed} | {o.unmet} | {o.position_error_cm:.2f} | {o.ik_failures} |" for o in failures]
         lines += [""]
@@ -131,12 +145,16 @@ def _draw(path: Path, run: Run, outcomes: list[Outcome], summary: dict[str, Any]
         for chosen, colour, word in ((success, "tab:green", "success"), (~success, "tab:red", "failure")):
             if chosen.any():
                 # The robot looks along +x: show its left on the left.
-                area.scatter(-starts[chosen, i, 1], starts[chosen, i, 0], s=14, c=colour, marker=marker, label=f"{name}: {word}")
+                area.scatter(
+                    -starts[chosen, i, 1], starts[chosen, i, 0], s=14, c=colour, marker=marker, label=f"{name}: {word}"
+                )
     area.set(xlabel="to the right of the robot, m", ylabel="in front of the robot, m", title="Start positions")
     area.set_aspect("equal")
     area.legend(fontsize=8)
     errors = summary["position_error_cm_by_primitive"]
-    bars.bar(list(errors), [v["mean"] for v in errors.values()], yerr=[v["std"] for v in errors.values()], color="tab:blue")
+    bars.bar(
+        list(errors), [v["mean"] for v in errors.values()], yerr=[v["std"] for v in errors.values()], color="tab:blue"
+    )
     bars.set(ylabel="cm from the expert's hands", title="Position error")
     bars.tick_params(axis="x", rotation=30)
     figure.suptitle(f"{run.task}: {headline(summary)}", fontsize=10)

@@ -42,21 +42,27 @@ def write_recording(folder: Path, env: BimanualEnv, outcome: Outcome, trace: Tra
         times = np.arange(len(trace.state)) * env.world.physics.control_period
         _log_scene(stream, env)
         _log_robot(stream, env, trace, times)
-        for name, poses in zip(env.task_spec.observed, trace.environment_state.reshape(len(times), -1, 7).swapaxes(0, 1), strict=True):
+        for name, poses in zip(
+            env.task_spec.observed, trace.environment_state.reshape(len(times), -1, 7).swapaxes(0, 1), strict=True
+        ):
             _send_poses(stream, f"world/{name}", poses, times)
         _log_hands(stream, "executed", trace.state, times)
         _log_hands(stream, "commanded", trace.action, times[:-1])
-        _log_hands(stream, "expert", reference.state, np.arange(len(reference.state)) * env.world.physics.control_period)
+        _log_hands(
+            stream, "expert", reference.state, np.arange(len(reference.state)) * env.world.physics.control_period
+        )
         _log_primitives(stream, env, trace, times)
         _log_scalars(stream, env, outcome, trace, times)
     return path
 
 
-def _columns(times: NDArray[np.float64]) -> list[rr.TimeColumn]:
+def _columns(times: NDArray[np.floating]) -> list[rr.TimeColumn]:
     return [rr.TimeColumn(TIMELINE, duration=times)]
 
 
-def _send_poses(stream: rr.RecordingStream, entity: str, poses: NDArray[np.floating], times: NDArray[np.float64]) -> None:
+def _send_poses(
+    stream: rr.RecordingStream, entity: str, poses: NDArray[np.floating], times: NDArray[np.floating]
+) -> None:
     """(T, 7) poses in the world as the transform of an entity."""
     columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, 3:])
     stream.send_columns(entity, _columns(times), columns)
@@ -80,12 +86,12 @@ def _log_scene(stream: rr.RecordingStream, env: BimanualEnv) -> None:
             pose = env.world.pose(body.name)
             stream.log(
                 f"world/{body.name}",
-                rr.Transform3D(translation=pose.position, quaternion=pose.quaternion),
+                rr.Transform3D(translation=pose.position, quaternion=pose.quaternion.tolist()),
                 static=True,
             )
 
 
-def _log_robot(stream: rr.RecordingStream, env: BimanualEnv, trace: Trace, times: NDArray[np.float64]) -> None:
+def _log_robot(stream: rr.RecordingStream, env: BimanualEnv, trace: Trace, times: NDArray[np.floating]) -> None:
     """The robot's own meshes, moved joint by joint."""
     spec = env.robot_spec
     tree = rr.urdf.UrdfTree.from_file_path(spec.urdf(True), entity_path_prefix="robot")
@@ -95,7 +101,7 @@ def _log_robot(stream: rr.RecordingStream, env: BimanualEnv, trace: Trace, times
         "robot/base_in_world",
         rr.Transform3D(
             translation=base.position,
-            quaternion=base.quaternion,
+            quaternion=base.quaternion.tolist(),
             parent_frame=WORLD_FRAME,
             child_frame=tree.root_link().name,
         ),
@@ -107,10 +113,12 @@ def _log_robot(stream: rr.RecordingStream, env: BimanualEnv, trace: Trace, times
             raise ValueError(f"{spec.name}'s URDF has no joint {name!r}")
         # A finger that is pressed leaves its limits by a hair: clamping would print a warning for every frame.
         values = trace.joints[:, column].tolist()
-        stream.send_columns(f"robot/joints/{name}", _columns(times), joint.compute_transform_columns(values, clamp=False))
+        stream.send_columns(
+            f"robot/joints/{name}", _columns(times), joint.compute_transform_columns(values, clamp=False)
+        )
 
 
-def _log_hands(stream: rr.RecordingStream, kind: str, rows: NDArray[np.floating], times: NDArray[np.float64]) -> None:
+def _log_hands(stream: rr.RecordingStream, kind: str, rows: NDArray[np.floating], times: NDArray[np.floating]) -> None:
     poses = hand_poses(rows)
     for i, side in enumerate(SIDES):
         colour, path = COLOURS[kind][i], poses[:, i, :3]
@@ -125,7 +133,7 @@ def _log_hands(stream: rr.RecordingStream, kind: str, rows: NDArray[np.floating]
         stream.send_columns(f"world/hands/{side}/{kind}", _columns(times), columns)
 
 
-def _log_primitives(stream: rr.RecordingStream, env: BimanualEnv, trace: Trace, times: NDArray[np.float64]) -> None:
+def _log_primitives(stream: rr.RecordingStream, env: BimanualEnv, trace: Trace, times: NDArray[np.floating]) -> None:
     """A lane of the expert's labels and one of the policy's."""
     names = env.task_spec.labels
     for lane, labels in (("scripted", trace.scripted), ("predicted", trace.predicted)):
@@ -137,9 +145,9 @@ def _log_primitives(stream: rr.RecordingStream, env: BimanualEnv, trace: Trace, 
 
 
 def _log_scalars(
-    stream: rr.RecordingStream, env: BimanualEnv, outcome: Outcome, trace: Trace, times: NDArray[np.float64]
+    stream: rr.RecordingStream, env: BimanualEnv, outcome: Outcome, trace: Trace, times: NDArray[np.floating]
 ) -> None:
-    def send(entity: str, values: NDArray[np.floating], at: NDArray[np.float64]) -> None:
+    def send(entity: str, values: NDArray[np.floating], at: NDArray[np.floating]) -> None:
         stream.send_columns(entity, _columns(at), rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64)))
 
     told, went = hand_poses(trace.action), hand_poses(trace.state[1:])

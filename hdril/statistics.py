@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from statsmodels.stats.proportion import proportion_confint
 
 
@@ -13,5 +14,6 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
     """
     if trials < 1 or not 0 <= successes <= trials:
         raise ValueError(f"an interval needs 0 <= successes <= trials and a trial, got {successes} of {trials}")
-    low, high = proportion_confint(successes, trials, alpha=1.0 - confidence, method="wilson")
-    return float(low), float(high)
+    interval = proportion_confint(successes, trials, alpha=1.0 - confidence, method="wilson")
+    low, high = np.asarray(interval, dtype=np.float64).tolist()
+    return low, high

@@ -173,7 +173,10 @@ class World:
         dynamics: dict[str, Any] = {"lateralFriction": spec.friction, "frictionAnchor": int(spec.anchored)}
         if spec.mass > 0:
             # Never asleep: a sleeping body does not survive saveState, and would not feel a slow push.
-            dynamics |= {"localInertiaDiagonal": spec.inertia, "activationState": bullet.ACTIVATION_STATE_DISABLE_SLEEPING}
+            dynamics |= {
+                "localInertiaDiagonal": spec.inertia,
+                "activationState": bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
+            }
         self._call("changeDynamics", body, -1, **dynamics)
         self._register(spec.name, body, spec.name)
         self._specs[spec.name] = spec

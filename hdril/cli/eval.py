@@ -61,7 +61,9 @@ def _check(config: EvalConfig) -> None:
     path = Path(config.policy.path)
     looks_local = path.is_absolute() or path.parts[:1] in ((".",), ("..",)) or len(path.parts) != 2
     if not (path / "config.json").exists() and (looks_local or path.exists()):
-        raise FileNotFoundError(f"no checkpoint at {path}: it should be a folder with config.json and model.safetensors")
+        raise FileNotFoundError(
+            f"no checkpoint at {path}: it should be a folder with config.json and model.safetensors"
+        )
 
 
 def eval_command(config: EvalConfig, overrides: tuple[str, ...] = ()) -> None:
@@ -72,7 +74,9 @@ def eval_command(config: EvalConfig, overrides: tuple[str, ...] = ()) -> None:
     seeds = list(range(config.seed, config.seed + config.num_episodes))
     held_out = check_held_out(training_provenance(config.policy.path), config.task, seeds)
     if not held_out:
-        print(f"Note: the training data of {config.policy.path} are not at hand; whether these seeds were in them is not known.")
+        print(
+            f"Note: the training data of {config.policy.path} are not at hand; whether these seeds were in them is not known."
+        )
     what = Run(config.task, config.policy.path, overrides, config.seed, config.num_episodes, held_out)
     partial = output.with_name(output.name + ".partial")
     done = _resume(partial, what)

@@ -50,9 +50,7 @@ def record_command(config: RecordConfig) -> None:
             bar.update(kept - bar.n)
 
         try:
-            recording = record(
-                recipe, config.num_episodes, config.seed, config.repo_id, root, config.workers, progress
-            )
+            recording = record(recipe, config.num_episodes, config.seed, config.repo_id, root, config.workers, progress)
         except KeyboardInterrupt:
             bar.close()
             print(f"\nStopped; nothing was written to {root}. Run the same command again to go on.")

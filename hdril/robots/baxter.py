@@ -68,7 +68,9 @@ def _prepare(link: ElementTree.Element, meshes: bool) -> None:
     if name == "base":  # the fixed root; without inertia PyBullet prints a warning at every start
         inertial = ElementTree.SubElement(link, "inertial")
         ElementTree.SubElement(inertial, "mass", {"value": "1"})
-        ElementTree.SubElement(inertial, "inertia", dict(ixx="1", ixy="0", ixz="0", iyy="1", iyz="0", izz="1"))
+        ElementTree.SubElement(
+            inertial, "inertia", {"ixx": "1", "ixy": "0", "ixz": "0", "iyy": "1", "iyz": "0", "izz": "1"}
+        )
     collisions = link.findall("collision")
     if name in COLLISION_BOXES:
         size, centre = COLLISION_BOXES[name]
@@ -88,7 +90,9 @@ def _prepare(link: ElementTree.Element, meshes: bool) -> None:
         visual = ElementTree.SubElement(link, "visual")
         visual.extend(list(shape))
         material = ElementTree.SubElement(visual, "material", {"name": "baxter"})
-        ElementTree.SubElement(material, "color", {"rgba": "0.55 0.13 0.13 1" if "finger" not in name else "0.2 0.2 0.2 1"})
+        ElementTree.SubElement(
+            material, "color", {"rgba": "0.55 0.13 0.13 1" if "finger" not in name else "0.2 0.2 0.2 1"}
+        )
 
 
 def _write_once(text: str, stem: str) -> Path:

@@ -1,7 +1,7 @@
 """Table lift (paper, Section 5.2): slide a table to the middle, lift it, and set it down on a platform.
 
 Sizes and start area are the paper's (35 x 85 cm; 20 x 60 cm); mass, handles and platform are ours, chosen so that one
-arm cannot do it (``docs`` of the paper's released code: objects there appear in the hands).
+arm cannot do it and the jaws close on nothing but the handles.
 """
 
 from __future__ import annotations

@@ -12,6 +12,8 @@ from hdril.geometry import Pose
 from hdril.primitives import Primitive
 from hdril.world import BodySpec, Camera
 
+DEFAULT_CAMERA = Camera()
+
 
 @dataclass(frozen=True)
 class Uniform:
@@ -41,7 +43,7 @@ class Task:
     observed: tuple[str, ...]
     primitives: tuple[Primitive, ...]
     success: tuple[Condition, ...]
-    camera: Camera = Camera()
+    camera: Camera = DEFAULT_CAMERA
 
     def __post_init__(self) -> None:
         names = [body.name for body in self.bodies]

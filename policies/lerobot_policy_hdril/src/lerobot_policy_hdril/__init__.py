@@ -8,6 +8,6 @@ from lerobot_policy_hdril.processor_hdril import make_hdril_pre_post_processors
 
 # With the simulator installed, --env.type=hdril comes along. The policy does not need it.
 with suppress(ModuleNotFoundError):
-    import hdril.lerobot_env
+    import hdril.lerobot_env  # noqa: F401
 
 __all__ = ["HDRILConfig", "HDRILPolicy", "make_hdril_pre_post_processors"]

@@ -50,8 +50,8 @@ class HDRILConfig(PreTrainedConfig):
     """Look again every so many frames within a primitive as well; 0: at its start alone."""
 
     # Sizes.
-    hidden_dim: int = 256
-    node_dim: int = 64
+    hidden_dim: int = 128
+    node_dim: int = 32
     planner_hidden_dim: int = 128
     planner_batch_size: int = 8
     """Whole episodes per step that train the planner. It learns in a fraction of the steps that the dynamics need."""
@@ -64,7 +64,7 @@ class HDRILConfig(PreTrainedConfig):
 
     # Optimisation.
     optimizer_lr: float = 1e-3
-    optimizer_lr_state_skip: float = 1e-2
+    optimizer_lr_state_skip: float = 3e-2
     """The linear maps start at 0 and must reach 1; at the network's rate Adam would take a thousand steps for that."""
     optimizer_weight_decay: float = 1e-4
     optimizer_grad_clip_norm: float = 1.0

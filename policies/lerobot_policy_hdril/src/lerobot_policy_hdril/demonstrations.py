@@ -58,7 +58,7 @@ def read_primitives(root: Path) -> list[str]:
     if not path.exists():
         raise ValueError(f"the dataset has no {SUBTASKS_PATH}: its primitives have no names")
     table = pd.read_parquet(path).sort_values("subtask_index")
-    return [str(name) for name in (table["subtask"] if "subtask" in table else table.index)]
+    return [str(name) for name in (table.get("subtask", table.index))]
 
 
 def _matrix(table, key: str) -> np.ndarray:
@@ -114,11 +114,14 @@ class Demonstrations:
         count = len(self.primitives)
         if labels.min() < 0 or labels.max() >= count:
             raise ValueError(
-                f"labels go from {labels.min()} to {labels.max()}, but {SUBTASKS_PATH} names {count}: {', '.join(self.primitives)}"
+                f"labels go from {labels.min()} to {labels.max()}, but {SUBTASKS_PATH} names {count}: "
+                f"{', '.join(self.primitives)}"
             )
         missing = [name for i, name in enumerate(self.primitives) if not (labels == i).any()]
         if missing:
-            raise ValueError(f"no frame of the dataset is labelled {', '.join(missing)}; there is nothing to learn it from")
+            raise ValueError(
+                f"no frame of the dataset is labelled {', '.join(missing)}; there is nothing to learn it from"
+            )
 
     @staticmethod
     def _bounds(starts: np.ndarray, device: str) -> Tensor:

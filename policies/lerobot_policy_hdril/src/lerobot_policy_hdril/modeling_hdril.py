@@ -82,7 +82,9 @@ class HDRILPolicy(PreTrainedPolicy):
             self._demonstrations = Demonstrations(dataset_meta, config.subtask_key, config.device or "cpu")
             config.learn_primitives(self._demonstrations.primitives, self._demonstrations.lengths)
         if not config.primitives:
-            raise ValueError("hdril learns its primitives from a dataset: train it with lerobot-train, or load a checkpoint")
+            raise ValueError(
+                "hdril learns its primitives from a dataset: train it with lerobot-train, or load a checkpoint"
+            )
         self._build()
         if dataset_stats is not None:
             self._set_normalisation(dataset_stats)
@@ -164,7 +166,9 @@ class HDRILPolicy(PreTrainedPolicy):
             raise RuntimeError("this policy was loaded without a dataset: train it with lerobot-train")
         rows = self._demonstrations.rows(batch["index"].flatten())
         dynamics_loss = self._dynamics_loss(self._demonstrations.window(rows, self.config.replan_every))
-        planner_loss, accuracy = self._planner_loss(self._demonstrations.history(rows[: self.config.planner_batch_size]))
+        planner_loss, accuracy = self._planner_loss(
+            self._demonstrations.history(rows[: self.config.planner_batch_size])
+        )
         loss = dynamics_loss + planner_loss
         if not torch.isfinite(loss):
             raise FloatingPointError(
@@ -253,7 +257,9 @@ class HDRILPolicy(PreTrainedPolicy):
         """Update the planner, end and begin primitives, and make the plans that are due."""
         config, rollout = self.config, self._rollout
         if rollout is None or len(rollout.primitive) != len(state):
-            rollout = Rollout.begin(len(state), self.longest, len(self.loss_weights), len(config.primitives), state.device)
+            rollout = Rollout.begin(
+                len(state), self.longest, len(self.loss_weights), len(config.primitives), state.device
+            )
             self._rollout = rollout
         elif config.rollout == "open_loop":
             # The state that the plan predicted for this frame, whatever is seen.

@@ -23,5 +23,5 @@ class Planner(nn.Module):
         """States (B, T, S), and the memory (1, B, H) of what was before them, to logits (B, T, K) and the new memory."""
         batch, time, _ = normalised.shape
         nodes = self.graph(normalised.flatten(0, 1), raw.flatten(0, 1)).unflatten(0, (batch, time))
-        hidden, memory = self.gru(nodes, memory)
-        return self.head(hidden), memory
+        hidden, last = self.gru(nodes, memory)
+        return self.head(hidden), last

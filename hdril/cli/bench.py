@@ -1,0 +1,146 @@
+"""hdril-bench: speeds as ratios within one run, because an absolute time says more of the machine than of the code."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from hdril.cli.common import run
+from hdril.demonstrator import Demonstrator
+from hdril.recording import Recipe, record
+from hdril.tasks import TASKS
+
+
+@dataclass
+class BenchConfig:
+    """Measure recording against the bare simulator, the loader against a training step, and one action."""
+
+    task: str = "table_lift"
+    """Task: table_lift."""
+    episodes: int = 12
+    """Episodes that are recorded."""
+    train_steps: int = 60
+    """Training steps that are timed, after ten to warm up."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A measured number, and the limit that it should keep."""
+
+    name: str
+    value: float
+    limit: float
+    at_least: bool
+    unit: str
+
+    def __str__(self) -> str:
+        ok = self.value >= self.limit if self.at_least else self.value <= self.limit
+        bound = "at least" if self.at_least else "at most"
+        return f"{'ok  ' if ok else 'MISS'}  {self.name}: {self.value:.2f} {self.unit} ({bound} {self.limit:g})"
+
+
+def _seconds(function: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    function()
+    return time.perf_counter() - start
+
+
+def bench_recording(task: str, episodes: int, root: Path) -> Figure:
+    """Recording, files included, against bare timesteps of the same scenes in the same states, both on one core.
+
+    The bare run replays the joint targets of each control period, so that its contacts are those of a demonstration.
+    """
+    recipe = Recipe(task)
+    env = recipe.make_env()
+    expert = Demonstrator(env.task_spec, recipe.noise)
+    bare = 0.0
+    step = env.world.step
+
+    def timed_step(count: int = 1) -> None:
+        nonlocal bare
+        bare += _seconds(lambda: step(count))
+
+    env.world.step = timed_step  # type: ignore[method-assign]
+    with closing(env.world):
+        for seed in range(episodes):
+            observation, _ = env.reset(seed=seed)
+            expert.reset(seed)
+            done = False
+            while not done:
+                observation, _, terminated, truncated, _ = env.step(expert.act(observation).action)
+                done = terminated or truncated
+    import lerobot.datasets.dataset_metadata  # noqa: F401  # its import is a start-up cost, not recording's
+
+    whole = _seconds(lambda: record(recipe, episodes, 0, "hdril/bench", root))
+    return Figure("recording, share of the bare simulator's rate", 100.0 * bare / whole, 70.0, True, "%")
+
+
+def bench_training(root: Path, steps: int, output: Path) -> Figure:
+    """Share of a step of stock ``lerobot-train`` that waits for the loader."""
+    import re
+    import subprocess
+    import sys
+
+    warmup = 10
+    command = [
+        str(Path(sys.executable).with_name("lerobot-train")),
+        "--config_path=configs/train/table_lift.yaml",
+        f"--dataset.root={root}",
+        f"--output_dir={output}",
+        f"--steps={warmup + steps}",
+        "--log_freq=10",
+        "--save_checkpoint=false",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"HF_HUB_OFFLINE": "1"}, check=False)
+    times = re.findall(r"updt_s:([\d.]+) data_s:([\d.]+)", done.stderr + done.stdout)
+    if len(times) < 2:
+        raise RuntimeError(f"lerobot-train failed: {done.stderr.strip().splitlines()[-1:]}")
+    update = sum(float(u) for u, _ in times[1:])
+    data = sum(float(d) for _, d in times[1:])
+    return Figure("loader, share of a training step", 100.0 * data / (update + data), 30.0, False, "%")
+
+
+def bench_action(root: Path, task: str) -> Figure:
+    """One ``select_action`` on one core, averaged over an episode."""
+    import torch
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from lerobot.policies.factory import make_policy
+    from lerobot_policy_hdril import HDRILConfig
+
+    torch.set_num_threads(1)
+    metadata = LeRobotDatasetMetadata("hdril/bench", root=root)
+    policy = make_policy(HDRILConfig(device="cpu", push_to_hub=False), ds_meta=metadata)
+    batch = {key: torch.zeros(1, *metadata.features[key]["shape"]) for key in metadata.features if "observation" in key}
+    horizon = TASKS[task].horizon
+
+    def episode() -> None:
+        policy.reset()
+        for _ in range(horizon):
+            policy.select_action(batch)
+
+    episode()
+    best = min(_seconds(episode) for _ in range(5))
+    return Figure("one action, amortised over an episode", 1e3 * best / horizon, 2.0, False, "ms")
+
+
+def bench_command(config: BenchConfig) -> None:
+    Recipe(config.task)
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder) / "dataset"
+        print(bench_recording(config.task, config.episodes, root), flush=True)
+        print(bench_training(root, config.train_steps, Path(folder) / "train"), flush=True)
+        print(bench_action(root, config.task), flush=True)
+
+
+def main() -> None:
+    """Entry point."""
+    run("hdril-bench", BenchConfig, bench_command)
+
+
+if __name__ == "__main__":
+    main()
