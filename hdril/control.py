@@ -150,49 +150,48 @@ def join_action(commands: dict[str, HandCommand]) -> NDArray[np.float64]:
 class EndEffectorController:
     """Drives a two-armed robot to commanded hand poses, one control period at a time.
 
-    Motor targets move, no faster than the joints' speed limits, on a straight line in joint space from the last command to the new one, so that the arms arrive
-    at the end of the period instead of rushing there. When inverse kinematics has no answer for an arm, that arm keeps
-    its last target and :attr:`failures` says so.
+    Motor targets move on a straight line in joint space from the last command to the new one, no faster than the
+    joints' speed limits, so that the arms arrive at the end of the period instead of rushing there. When inverse
+    kinematics has no answer for an arm, that arm keeps its last target and :attr:`failures` says so.
     """
 
     RAMP_STEPS = 8
     """Motor targets per control period. More cost time and change nothing that was measured."""
 
-    def __init__(self, world: World, robot: RobotSpec, settings: IKSettings | None = None) -> None:
-        self._world, self._robot = world, robot
+    def __init__(self, robot: RobotSpec, settings: IKSettings | None = None) -> None:
+        self._robot = robot
         self.settings = settings or IKSettings()
         self._chains = {side: Chain(robot.source(), robot.base_link, arm.tool) for side, arm in robot.arms.items()}
         self._base_inverse = robot.base.inverse()
         self._posture = {side: np.array(arm.posture) for side, arm in robot.arms.items()}
         arm_joints = [joint for arm in robot.arms.values() for joint in arm.joints]
         finger_joints = [joint for arm in robot.arms.values() for joint in arm.gripper.joints]
-        joints = [*arm_joints, *finger_joints]
+        self.joint_names = [*arm_joints, *finger_joints]
+        """The joints that it drives: arms, then fingers, left before right."""
+        self._arm_count = len(arm_joints)
         actuation = robot.actuation
-        self._joint_names = joints
-        self._indices = world.joint_indices(ROBOT, joints)
-        self._fingers = {side: world.joint_indices(ROBOT, arm.gripper.joints) for side, arm in robot.arms.items()}
         self._gains = [actuation.arm_gain] * len(arm_joints) + [actuation.finger_gain] * len(finger_joints)
-        self._forces = [actuation.efforts[joint] for joint in joints]
-        self._reach = {
-            side: world.physics.control_period * np.array([actuation.velocities[joint] for joint in arm.joints])
-            for side, arm in robot.arms.items()
+        self._forces = [actuation.efforts[joint] for joint in self.joint_names]
+        self._max_speeds = {
+            side: np.array([actuation.velocities[joint] for joint in arm.joints]) for side, arm in robot.arms.items()
         }
-        self._targets = np.empty(0)
-        self._arm_targets: dict[str, NDArray[np.float64]] = {}
         self.results: dict[str, IKResult] = {}
+
+    def start(self, world: World) -> None:
+        """Take over the robot of a new world: arms in their posture, hands open, held there."""
+        self._world = world
+        self._indices = world.joint_indices(ROBOT, self.joint_names)
+        self._fingers = {side: world.joint_indices(ROBOT, arm.gripper.joints) for side, arm in self._robot.arms.items()}
+        self._arm_targets = {side: posture.copy() for side, posture in self._posture.items()}
+        self._targets = self._joint_targets(dict.fromkeys(SIDES, 1.0))
+        world.reset_joints(ROBOT, self.joint_names, self._targets.tolist())
+        self._drive(self._targets)
+        self.results = {}
 
     @property
     def failures(self) -> dict[str, str]:
         """Why inverse kinematics failed at the last command, by side; empty if it did not."""
         return {side: result.reason for side, result in self.results.items() if not result.ok}
-
-    def home(self) -> None:
-        """Put the arms in their posture, hands open, and hold them there. Before an episode only."""
-        self._arm_targets = {side: posture.copy() for side, posture in self._posture.items()}
-        self._targets = self._joint_targets(dict.fromkeys(SIDES, 1.0))
-        self._world.reset_joints(ROBOT, self._joint_names, self._targets)  # type: ignore[arg-type]
-        self._drive(self._targets)
-        self.results = {}
 
     def _joint_targets(self, openings: dict[str, float]) -> NDArray[np.float64]:
         fingers = [self._robot.arms[side].gripper.targets(openings[side]) for side in SIDES]
@@ -203,6 +202,7 @@ class EndEffectorController:
 
     def apply(self, commands: dict[str, HandCommand]) -> None:
         """Run one control period towards ``commands``."""
+        period = self._world.physics.control_period
         for side, command in commands.items():
             target = self._base_inverse @ command.pose
             result = solve_ik(self._chains[side], target, self._arm_targets[side], self._posture[side], self.settings)
@@ -210,16 +210,14 @@ class EndEffectorController:
             if result.ok:
                 # All joints are slowed alike, so that the hand lags on its path instead of leaving it.
                 step = result.joints - self._arm_targets[side]
-                self._arm_targets[side] = self._arm_targets[side] + step / max(
-                    1.0, np.abs(step / self._reach[side]).max()
-                )
+                slowdown = max(1.0, float(np.abs(step / (period * self._max_speeds[side])).max()))
+                self._arm_targets[side] = self._arm_targets[side] + step / slowdown
         goal = self._joint_targets({side: command.opening for side, command in commands.items()})
-        arms = len(goal) - sum(len(fingers) for fingers in self._fingers.values())
         substeps = self._world.physics.substeps
         start, done = self._targets, 0
         for i in range(1, self.RAMP_STEPS + 1):
             targets = start + (goal - start) * (i / self.RAMP_STEPS)
-            targets[arms:] = goal[arms:]  # fingers close at their own speed
+            targets[self._arm_count :] = goal[self._arm_count :]  # fingers close at their own speed
             self._drive(targets)
             upto = i * substeps // self.RAMP_STEPS
             self._world.step(upto - done)

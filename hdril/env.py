@@ -50,8 +50,9 @@ class BimanualEnv(gym.Env):
         self.task, self.task_description = self.task_spec.name, self.task_spec.description
         self.render_mode = render_mode
         self._max_episode_steps = max_episode_steps or self.task_spec.horizon
-        self.world = World(physics)
-        self.controller = self._build(meshes)
+        self._physics, self._meshes = physics or Physics(), meshes
+        self._world: World | None = None
+        self.controller = EndEffectorController(self.robot_spec)
         high = np.full(7 * len(self.task_spec.observed), np.inf, np.float32)
         self.observation_space = spaces.Dict(
             {
@@ -65,14 +66,20 @@ class BimanualEnv(gym.Env):
         self.frame = 0
 
     @property
-    def joint_names(self) -> list[str]:
-        """The joints that move: arms, then fingers, left before right."""
-        arms = self.robot_spec.arms.values()
-        return [joint for arm in arms for joint in arm.joints] + [j for arm in arms for j in arm.gripper.joints]
+    def world(self) -> World:
+        """The world of the running episode.
 
-    def _build(self, meshes: bool) -> EndEffectorController:
-        world, robot, task = self.world, self.robot_spec, self.task_spec
-        world.add_urdf(ROBOT, robot.urdf(meshes), robot.base, self_collision=True)
+        Raises:
+            RuntimeError: there was no :meth:`reset`, or the environment is closed.
+        """
+        if self._world is None:
+            raise RuntimeError("no episode is running: reset() the environment first")
+        return self._world
+
+    def _new_world(self) -> World:
+        """The robot, and every body where the episode's random numbers put it."""
+        robot, task, world = self.robot_spec, self.task_spec, World(self._physics)
+        world.add_urdf(ROBOT, robot.urdf(self._meshes), robot.base, self_collision=True)
         world.ignore_collisions(ROBOT, robot.ignored_collisions(world.links(ROBOT)))
         pads = [pad for arm in robot.arms.values() for pad in arm.gripper.pads]
         world.set_link_dynamics(
@@ -83,24 +90,19 @@ class BimanualEnv(gym.Env):
             frictionAnchor=1,
         )
         world.set_joint_velocity_limits(ROBOT, robot.actuation.velocities)
-        for i, body in enumerate(task.bodies):
-            # Out of everything's way: what is placed later leaves no trace in the solver's memory of contacts.
-            world.add_body(
-                body, task.placements[body.name].sample(np.random.default_rng(0)).translated((0, 0, 10.0 * i))
-            )
-        world.freeze()
-        return EndEffectorController(world, robot)
+        for body in task.bodies:
+            world.add_body(body, task.placements[body.name].sample(self.np_random))
+        return world
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, NDArray[np.float32]], dict[str, Any]]:
         """Put the objects where the seed says, the arms in their posture, and let everything come to rest."""
         super().reset(seed=seed)
-        self.world.restore()
-        for body in self.task_spec.bodies:
-            self.world.place(body.name, self.task_spec.placements[body.name].sample(self.np_random))
-        self.controller.home()
-        self.controller.hold(SETTLE_PERIODS * self.world.physics.substeps)
+        self.close()
+        self._world = self._new_world()
+        self.controller.start(self._world)
+        self.controller.hold(SETTLE_PERIODS * self._physics.substeps)
         self.frame = 0
         return self._observe(), {"is_success": False}
 
@@ -112,10 +114,11 @@ class BimanualEnv(gym.Env):
         Raises:
             ValueError: the action has another shape or is not finite; names the entries.
         """
+        world = self.world
         self.controller.apply(split_action(action))
         self.frame += 1
         over = self.frame >= self.task_spec.horizon
-        missing = failed(self.task_spec.success, self.world) if over else ("the primitives are not over",)
+        missing = failed(self.task_spec.success, world) if over else ("the primitives are not over",)
         success = not missing
         info = {
             "is_success": success,
@@ -138,4 +141,7 @@ class BimanualEnv(gym.Env):
         return self.world.render(self.task_spec.camera)
 
     def close(self) -> None:
-        self.world.close()
+        """Give the simulator back; a reset() opens a new one."""
+        if self._world is not None:
+            self._world.close()
+            self._world = None

@@ -109,7 +109,7 @@ class LeRobotActor:
 def run_episode(env: BimanualEnv, act: Act, seed: int, labels: NDArray[np.int64]) -> tuple[Trace, bool, str]:
     """Play the scene of ``seed``; ``labels`` are the expert's."""
     observation, _ = env.reset(seed=seed)
-    joints = env.world.joint_indices(ROBOT, env.joint_names)
+    joints = env.world.joint_indices(ROBOT, env.controller.joint_names)
     observations, positions = [observation], [env.world.joint_positions(ROBOT, joints)]
     actions, rewards, predicted, failures = [], [], [], []
     done, info = False, {}

@@ -125,7 +125,7 @@ def episodes(recipe: Recipe, first_seed: int, workers: int = 1) -> Generator[Epi
     if workers == 1:
         env = recipe.make_env()
         expert = Demonstrator(env.task_spec, recipe.noise)
-        with closing(env.world):
+        with closing(env):
             for seed in range(first_seed, MAX_SEED):
                 yield demonstrate(env, expert, seed)
         return

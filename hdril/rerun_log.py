@@ -107,7 +107,7 @@ def _log_robot(stream: rr.RecordingStream, env: BimanualEnv, trace: Trace, times
         ),
         static=True,
     )
-    for column, name in enumerate(env.joint_names):
+    for column, name in enumerate(env.controller.joint_names):
         joint = tree.get_joint_by_name(name)
         if joint is None:
             raise ValueError(f"{spec.name}'s URDF has no joint {name!r}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -102,9 +102,9 @@ class Camera:
 class World:
     """A PyBullet world with a robot and bodies, addressed by name.
 
-    Build it once (:meth:`add_urdf`, :meth:`add_body`), call :meth:`freeze`, then :meth:`restore` before each episode:
-    that is bit-for-bit the same as a new world, and a thousand times faster. Between ``restore`` and the next one
-    nothing here moves a body but :meth:`step`.
+    Every episode gets a world of its own, which takes 50 ms. To save and restore one state would take less, but what
+    PyBullet restores differs in the last digits once the robot has touched something, and an episode could not be made
+    again bit for bit. Once the world has stepped, nothing here moves a body but :meth:`step`.
     """
 
     def __init__(self, physics: Physics | None = None) -> None:
@@ -118,8 +118,7 @@ class World:
         self._links: dict[str, dict[str, int]] = {}
         self._link_names: dict[int, dict[int, str]] = {}
         self._names: dict[int, str] = {}
-        self._saved: int | None = None
-        self._moved = False
+        self._began = False
         self._call("setPhysicsEngineParameter", fixedTimeStep=self.physics.timestep, numSubSteps=0,
                    numSolverIterations=self.physics.solver_iterations, deterministicOverlappingPairs=1)  # fmt: skip
         self._call("setGravity", 0.0, 0.0, -self.physics.gravity)
@@ -143,8 +142,8 @@ class World:
         self._link_names[body] = {index: link for link, index in self._links[name].items()}
 
     def _new(self, name: str) -> None:
-        if self._saved is not None:
-            raise RuntimeError(f"the world is frozen: {name!r} cannot be added")
+        if self._began:
+            raise RuntimeError(f"{name!r} cannot be added: the episode has begun")
         if name in self._ids:
             raise ValueError(f"there is already a body named {name!r}; bodies: {', '.join(self._ids)}")
 
@@ -200,17 +199,6 @@ class World:
     def links(self, body: str) -> tuple[str, ...]:
         return tuple(self._links[self._name(body)])
 
-    def freeze(self) -> None:
-        """End of building: remember this state as the one that :meth:`restore` goes back to."""
-        self._saved = self._call("saveState")
-
-    def restore(self) -> None:
-        """Back to the frozen state, before anything moved. Motor targets must be given again."""
-        if self._saved is None:
-            raise RuntimeError("freeze() the world before restore()")
-        self._call("restoreState", stateId=self._saved)
-        self._moved = False
-
     # ------------------------------------------------------------------ names
 
     def _name(self, body: str) -> str:
@@ -237,22 +225,13 @@ class World:
         """Resolve names once; the hot calls below take the result."""
         return [self._joint(body, joint) for joint in joints]
 
-    # ------------------------------------------------------------------ placing, before an episode only
-
-    def place(self, body: str, pose: Pose) -> None:
-        """Put a body at ``pose``, at rest. Only between :meth:`restore` and the first :meth:`step`.
+    def reset_joints(self, body: str, joints: Sequence[str], positions: Sequence[float]) -> None:
+        """Set joints at rest, rad or m.
 
         Raises:
-            RuntimeError: the episode runs: nothing is moved by hand then.
+            RuntimeError: the episode has begun; nothing is moved by hand then.
         """
-        if self._moved:
-            raise RuntimeError(f"{body!r} cannot be placed: the episode has begun")
-        at = pose @ Pose(self._specs[self._name(body)].centre_of_mass)
-        self._call("resetBasePositionAndOrientation", self._id(body), at.position, at.quaternion)
-
-    def reset_joints(self, body: str, joints: Sequence[str], positions: Sequence[float]) -> None:
-        """Set joints at rest, rad or m. Only before the first :meth:`step`, as :meth:`place`."""
-        if self._moved:
+        if self._began:
             raise RuntimeError(f"joints of {body!r} cannot be reset: the episode has begun")
         for joint, position in zip(joints, positions, strict=True):
             self._call("resetJointState", self._id(body), self._joint(body, joint), float(position))
@@ -261,7 +240,7 @@ class World:
 
     def step(self, count: int = 1) -> None:
         """Advance by ``count`` timesteps."""
-        self._moved = True
+        self._began = True
         for _ in range(count):
             bullet.stepSimulation(physicsClientId=self._client)
 
@@ -331,8 +310,3 @@ class World:
         image = self._call("getCameraImage", camera.width, camera.height, view, lens, lightDirection=(1.5, -1.0, 3.0),
                            shadow=0, flags=bullet.ER_NO_SEGMENTATION_MASK, renderer=bullet.ER_TINY_RENDERER)  # fmt: skip
         return np.ascontiguousarray(np.reshape(image[2], (camera.height, camera.width, 4))[:, :, :3], dtype=np.uint8)
-
-
-def with_mass(spec: BodySpec, mass: float) -> BodySpec:
-    """The same body, ``mass`` kg heavy."""
-    return replace(spec, mass=mass)

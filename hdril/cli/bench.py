@@ -6,14 +6,13 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
 from hdril.cli.common import run
-from hdril.demonstrator import Demonstrator
 from hdril.recording import Recipe, record
 from hdril.tasks import TASKS
+from hdril.world import World
 
 
 @dataclass
@@ -51,32 +50,20 @@ def _seconds(function: Callable[[], object]) -> float:
 
 
 def bench_recording(task: str, episodes: int, root: Path) -> Figure:
-    """Recording, files included, against bare timesteps of the same scenes in the same states, both on one core.
-
-    The bare run replays the joint targets of each control period, so that its contacts are those of a demonstration.
-    """
-    recipe = Recipe(task)
-    env = recipe.make_env()
-    expert = Demonstrator(env.task_spec, recipe.noise)
-    bare = 0.0
-    step = env.world.step
-
-    def timed_step(count: int = 1) -> None:
-        nonlocal bare
-        bare += _seconds(lambda: step(count))
-
-    env.world.step = timed_step  # type: ignore[method-assign]
-    with closing(env.world):
-        for seed in range(episodes):
-            observation, _ = env.reset(seed=seed)
-            expert.reset(seed)
-            done = False
-            while not done:
-                observation, _, terminated, truncated, _ = env.step(expert.act(observation).action)
-                done = terminated or truncated
+    """Share of recording, files included, that is spent in the simulator's own timesteps; one core."""
     import lerobot.datasets.dataset_metadata  # noqa: F401  # its import is a start-up cost, not recording's
 
-    whole = _seconds(lambda: record(recipe, episodes, 0, "hdril/bench", root))
+    bare, step = 0.0, World.step
+
+    def timed_step(world: World, count: int = 1) -> None:
+        nonlocal bare
+        bare += _seconds(lambda: step(world, count))
+
+    World.step = timed_step  # pyright: ignore
+    try:
+        whole = _seconds(lambda: record(Recipe(task), episodes, 0, "hdril/bench", root))
+    finally:
+        World.step = step
     return Figure("recording, share of the bare simulator's rate", 100.0 * bare / whole, 70.0, True, "%")
 
 
@@ -96,7 +83,9 @@ def bench_training(root: Path, steps: int, output: Path) -> Figure:
         "--log_freq=10",
         "--save_checkpoint=false",
     ]
-    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"HF_HUB_OFFLINE": "1"}, check=False)
+    done = subprocess.run(
+        command, capture_output=True, text=True, env=os.environ | {"HF_HUB_OFFLINE": "1"}, check=False
+    )
     times = re.findall(r"updt_s:([\d.]+) data_s:([\d.]+)", done.stderr + done.stdout)
     if len(times) < 2:
         raise RuntimeError(f"lerobot-train failed: {done.stderr.strip().splitlines()[-1:]}")

@@ -58,7 +58,8 @@ def read_primitives(root: Path) -> list[str]:
     if not path.exists():
         raise ValueError(f"the dataset has no {SUBTASKS_PATH}: its primitives have no names")
     table = pd.read_parquet(path).sort_values("subtask_index")
-    return [str(name) for name in (table.get("subtask", table.index))]
+    names = table["subtask"] if "subtask" in table.columns else table.index
+    return [str(name) for name in names]
 
 
 def _matrix(table, key: str) -> np.ndarray:
