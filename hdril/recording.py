@@ -308,12 +308,11 @@ def write_dataset(root: Path, repo_id: str, recipe: Recipe, kept: list[Episode],
     if writer is not None:
         writer.close()
     metadata.finalize()
-    # Without a name for the index, pandas calls the column what Rerun's loader looks for; LeRobot reads either.
-    for path, names, column in (
-        (root / "meta/tasks.parquet", [task.description], "task_index"),
-        (root / SUBTASKS_PATH, list(task.labels), "subtask_index"),
-    ):
-        pd.DataFrame({column: range(len(names))}, index=pd.Index(names)).to_parquet(path)
+    # Rerun's loader looks for the column that pandas makes of an index without a name, LeRobot reads it under any name.
+    tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([task.description]))
+    tasks.to_parquet(root / "meta/tasks.parquet")
+    subtasks = pd.DataFrame({"subtask_index": range(len(task.labels))}, index=pd.Index(task.labels, name="subtask"))
+    subtasks.to_parquet(root / SUBTASKS_PATH)
     shares = {name: sum(p.frames for p in task.primitives if p.name == name) / task.horizon for name in task.labels}
     (root / "meta/temporal_proportions_dense.json").write_text(json.dumps(shares, indent=2))
     provenance = {

@@ -19,7 +19,8 @@ from hdril.recording import Recipe, record
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Six recorded episodes of table lift, seeds 0 to 5; made once for all test processes."""
-    shared = tmp_path_factory.getbasetemp().parent
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
     root = shared / "table_lift_6"
     with FileLock(str(root) + ".lock"):
         if not root.exists():

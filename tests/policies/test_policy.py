@@ -1,0 +1,267 @@
+"""HDR-IL as a LeRobot policy: every variant trains, saves, loads and runs; what does not fit is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.policies.factory import make_policy
+from lerobot_policy_hdril import HDRILConfig, HDRILPolicy
+from lerobot_policy_hdril.demonstrations import Demonstrations
+
+SMALL = {"device": "cpu", "push_to_hub": False, "hidden_dim": 32, "node_dim": 8, "planner_hidden_dim": 16, "optimizer_lr": 1e-2}
+VARIANTS = {
+    "HDR-IL": {},
+    "GRU-GRU": {"interaction": "none", "skip": False, "per_primitive": False, "state_skip": False},
+    "Res": {"interaction": "none", "per_primitive": False, "state_skip": False},
+    "Int": {"interaction": "scalar", "skip": False, "per_primitive": False, "state_skip": False},
+    "Res Multi": {"interaction": "none", "state_skip": False},
+    "paper's HDR-IL": {"interaction": "scalar", "state_skip": False},
+    "ODE": {"decoder": "ode"},
+    "replanning": {"replan_every": 4},
+}
+
+
+@pytest.fixture(scope="module")
+def metadata(dataset: Path) -> LeRobotDatasetMetadata:
+    return LeRobotDatasetMetadata("hdril/test", root=dataset)
+
+
+def build(metadata: LeRobotDatasetMetadata, **values) -> HDRILPolicy:
+    torch.manual_seed(0)
+    return make_policy(HDRILConfig(**SMALL | values), ds_meta=metadata)  # pyright: ignore
+
+
+def observation(metadata: LeRobotDatasetMetadata, frames: list[int]) -> dict[str, torch.Tensor]:
+    data = pd.read_parquet(Path(metadata.root) / "data").iloc[frames]
+    return {key: torch.tensor(list(data[key])) for key in ("observation.state", "observation.environment_state")}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_variant_learns_saves_loads_and_runs(variant: str, metadata, tmp_path: Path) -> None:
+    policy = build(metadata, **VARIANTS[variant])
+    batch = {"index": torch.arange(0, 420, 9)}
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    first, _ = policy.forward(batch)
+    for _ in range(40):
+        loss, info = policy.forward(batch)
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    assert loss.item() < 0.5 * first.item()
+    assert set(info) == {"dynamics_loss", "planner_loss", "planner_accuracy"}
+    policy.save_pretrained(tmp_path / "checkpoint")
+    loaded = HDRILPolicy.from_pretrained(tmp_path / "checkpoint")
+    frames = [0, 70, 140]
+    policy.eval()
+    for t in range(25):
+        seen = observation(metadata, [frame + t for frame in frames])
+        together = policy.select_action(seen)
+        torch.testing.assert_close(loaded.select_action(seen), together, atol=0, rtol=0)
+        assert together.shape == (3, 16)
+        for group in ([3, 4, 5, 6], [11, 12, 13, 14]):
+            torch.testing.assert_close(together[:, group].norm(dim=-1), torch.ones(3))
+    assert policy.rollout is not None
+    torch.testing.assert_close(policy.rollout.probabilities.sum(-1), torch.ones(3))
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_batched_and_single_give_the_same_actions(variant: str, metadata) -> None:
+    policy = build(metadata, **VARIANTS[variant]).eval()
+    frames = [0, 70, 140]
+    together = []
+    for t in range(25):
+        together.append(policy.select_action(observation(metadata, [frame + t for frame in frames])))
+    for i, frame in enumerate(frames):
+        policy.reset()
+        for t in range(25):
+            alone = policy.select_action(observation(metadata, [frame + t]))
+            torch.testing.assert_close(alone[0], together[t][i], atol=1e-5, rtol=1e-4)
+
+
+def test_learns_names_and_primitives_from_the_dataset(metadata, tmp_path: Path) -> None:
+    policy = build(metadata)
+    policy.save_pretrained(tmp_path)
+    saved = json.loads((tmp_path / "config.json").read_text())
+    assert saved["primitives"] == ["grasp", "move", "lift", "extend", "place", "retract"]
+    assert saved["primitive_lengths"] == [[10, 10], [12, 12], [12, 12], [12, 12], [12, 12], [12, 12]]
+    assert saved["environment_names"][0] == "table.x"
+
+
+def test_windows_are_what_the_dataset_says(metadata) -> None:
+    data = pd.read_parquet(Path(metadata.root) / "data")
+    demonstrations = Demonstrations(metadata, "subtask_index", "cpu")
+    rows = torch.tensor([15, 70 + 69, 200])
+    window = demonstrations.window(rows, stride=0)
+    assert window.primitive.tolist() == [1, 5, 5]
+    assert window.elapsed.tolist() == [0, 0, 0]
+    torch.testing.assert_close(window.state[0, :16], torch.tensor(data["observation.state"][10]))
+    torch.testing.assert_close(window.target[0, 3, :16], torch.tensor(data["action"][13]))
+    torch.testing.assert_close(window.target[0, 3, 32:], torch.tensor(data["observation.environment_state"][14]))
+    assert window.mask.sum(1).tolist() == [12, 12, 12]
+    within = demonstrations.window(rows, stride=4)
+    assert within.elapsed.tolist() == [4, 8, 0]
+    assert within.mask.sum(1).tolist() == [8, 4, 12]
+    torch.testing.assert_close(within.target[0, 0, :16], torch.tensor(data["action"][14]))
+    history = demonstrations.history(rows)
+    assert history.mask.all()
+    assert history.state.shape == (3, 70, 23)
+    torch.testing.assert_close(history.state[1, 69, :16], torch.tensor(data["observation.state"][139]))
+
+
+def test_primitives_follow_the_planner_at_boundaries(metadata) -> None:
+    """The planner is made to say what comes next; it is heard when a primitive is over, and may repeat one."""
+    policy = build(metadata).eval()
+    wishes = iter([0] * 10 + [0] * 10 + [3] * 12 + [1] * 60)
+
+    def planner(normalised, raw, memory):
+        logits = torch.full((1, 1, 6), -9.0)
+        logits[..., next(wishes)] = 9.0
+        return logits, memory
+
+    policy.planner.forward = planner
+    played = []
+    for t in range(50):
+        policy.select_action(observation(metadata, [t]))
+        played.append(int(policy.rollout.primitive[0]))  # pyright: ignore
+    assert played == [0] * 20 + [3] * 12 + [1] * 18
+
+
+def test_open_loop_does_not_look(metadata) -> None:
+    policy = build(metadata, rollout="open_loop").eval()
+    first = [policy.select_action(observation(metadata, [t])) for t in range(30)]
+    policy.reset()
+    blind = [policy.select_action(observation(metadata, [0])) for _ in range(30)]
+    torch.testing.assert_close(torch.stack(first), torch.stack(blind))
+    looking = build(metadata, rollout="closed_loop").eval()
+    seeing = [looking.select_action(observation(metadata, [t])) for t in range(30)]
+    assert not torch.allclose(torch.stack(seeing), torch.stack(blind))
+
+
+def test_padding_does_not_count(metadata) -> None:
+    policy = build(metadata)
+    window = policy._demonstrations.window(torch.tensor([5, 15]), 0)  # pyright: ignore
+    assert window.mask[0].sum() == 10
+    before = policy._dynamics_loss(window)
+    window.target[0, 10:] += 100.0
+    torch.testing.assert_close(policy._dynamics_loss(window), before)
+
+
+def test_planner_and_dynamics_share_no_parameter(metadata) -> None:
+    policy = build(metadata)
+    loss, _ = policy._planner_loss(policy._demonstrations.history(torch.tensor([0])))  # pyright: ignore
+    loss.backward()
+    assert all(p.grad is None for p in policy.dynamics.parameters())
+    assert any(p.grad is not None for p in policy.planner.parameters())
+
+
+def test_does_not_need_the_simulator(tmp_path: Path, metadata) -> None:
+    """A checkpoint loads in a process that can import neither pybullet nor hdril."""
+    build(metadata).save_pretrained(tmp_path)
+    program = f"""
+import sys
+sys.modules["pybullet"] = sys.modules["hdril"] = None
+import torch
+from lerobot_policy_hdril import HDRILPolicy
+policy = HDRILPolicy.from_pretrained({str(tmp_path)!r})
+batch = {{"observation.state": torch.zeros(2, 16), "observation.environment_state": torch.zeros(2, 7)}}
+print(tuple(policy.select_action(batch).shape))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().endswith("(2, 16)")
+
+
+# ---------------------------------------------------------------------- what does not fit
+
+
+@pytest.fixture
+def copy(dataset: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(dataset, tmp_path / "copy"))
+
+
+def test_dataset_without_labels(copy: Path) -> None:
+    info = json.loads((copy / "meta/info.json").read_text())
+    del info["features"]["subtask_index"]
+    (copy / "meta/info.json").write_text(json.dumps(info))
+    with pytest.raises(ValueError, match="no column 'subtask_index' that labels its frames"):
+        build(LeRobotDatasetMetadata("hdril/test", root=copy))
+
+
+def test_dataset_without_names_of_labels(copy: Path) -> None:
+    (copy / "meta/subtasks.parquet").unlink()
+    with pytest.raises(ValueError, match=r"no meta/subtasks\.parquet"):
+        build(LeRobotDatasetMetadata("hdril/test", root=copy))
+
+
+def test_primitive_without_frames(copy: Path) -> None:
+    names = pd.read_parquet(copy / "meta/subtasks.parquet")
+    more = pd.DataFrame({"subtask_index": [6]}, index=pd.Index(["juggle"], name="subtask"))
+    pd.concat([names, more]).to_parquet(copy / "meta/subtasks.parquet")
+    with pytest.raises(ValueError, match="labelled juggle"):
+        build(LeRobotDatasetMetadata("hdril/test", root=copy))
+
+
+def test_labels_without_a_name(copy: Path) -> None:
+    pd.read_parquet(copy / "meta/subtasks.parquet").iloc[:3].to_parquet(copy / "meta/subtasks.parquet")
+    with pytest.raises(ValueError, match="labels go from 0 to 5"):
+        build(LeRobotDatasetMetadata("hdril/test", root=copy))
+
+
+def test_checkpoint_of_another_task(copy: Path, metadata, tmp_path: Path) -> None:
+    build(metadata).save_pretrained(tmp_path / "checkpoint")
+    names = pd.read_parquet(copy / "meta/subtasks.parquet").rename(index={"place": "stack"})
+    names.to_parquet(copy / "meta/subtasks.parquet")
+    config = HDRILConfig.from_pretrained(tmp_path / "checkpoint")
+    config.pretrained_path = tmp_path / "checkpoint"
+    with pytest.raises(ValueError, match=r"trained on another task: its primitives are .*place.*; the dataset's are .*stack"):
+        make_policy(config, ds_meta=LeRobotDatasetMetadata("hdril/test", root=copy))
+
+
+def test_observation_of_another_task(metadata) -> None:
+    policy = build(metadata)
+    batch = {"observation.state": torch.zeros(1, 16), "observation.environment_state": torch.zeros(1, 14)}
+    with pytest.raises(ValueError, match="is the environment of another task"):
+        policy.select_action(batch)
+
+
+def test_stats_that_lack_a_feature(metadata) -> None:
+    stats = {key: value for key, value in metadata.stats.items() if key != "action"}
+    config = build(metadata).config
+    with pytest.raises(ValueError, match="no mean of action"):
+        HDRILPolicy(config, dataset_stats=stats)
+
+
+def test_training_without_a_dataset(metadata, tmp_path: Path) -> None:
+    build(metadata).save_pretrained(tmp_path)
+    with pytest.raises(RuntimeError, match="without a dataset"):
+        HDRILPolicy.from_pretrained(tmp_path).forward({"index": torch.zeros(1, dtype=torch.long)})
+
+
+def test_loss_that_is_not_finite(metadata) -> None:
+    policy = build(metadata)
+    with torch.no_grad():
+        policy.planner.head[0].weight.fill_(float("nan"))
+    with pytest.raises(FloatingPointError, match="not finite"):
+        policy.forward({"index": torch.arange(4)})
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"interaction": "telepathy"}, "none, scalar, object"),
+        ({"decoder": "rnn"}, "gru, ode"),
+        ({"rollout": "sideways"}, "closed_loop, open_loop"),
+        ({"hidden_dim": 0}, "at least 1"),
+        ({"replan_every": -1}, "0 \\(never\\)"),
+    ],
+)
+def test_config_names_the_choices(values: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        HDRILConfig(**SMALL | values)
