@@ -1,0 +1,135 @@
+"""Metrics, intervals, held-out seeds, traces, recordings and reports."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hdril.demonstrator import Demonstrator
+from hdril.env import BimanualEnv
+from hdril.evaluation import Outcome, Trace, check_held_out, demonstrate_trace, judge, training_provenance
+from hdril.metrics import trajectory_error
+from hdril.primitives import Noise
+from hdril.recording import Provenance, Recipe
+from hdril.report import Run, headline, write_report
+from hdril.rerun_log import recording_name, write_recording
+from hdril.statistics import wilson_interval
+
+
+def test_wilson_interval_matches_its_formula() -> None:
+    z = 1.959963984540054
+    for k, n in ((0, 10), (97, 100), (120, 120)):
+        p, scale = k / n, 1 + z * z / n
+        middle = (p + z * z / (2 * n)) / scale
+        half = z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / scale
+        assert wilson_interval(k, n) == pytest.approx((middle - half, middle + half), abs=1e-9)
+    for k, n in ((0, 0), (3, 2), (-1, 5)):
+        with pytest.raises(ValueError, match="interval"):
+            wilson_interval(k, n)
+
+
+def straight(frames: int, offset: float = 0.0) -> np.ndarray:
+    state = np.zeros((frames, 16))
+    state[:, [6, 14]] = 1.0
+    state[:, 0] = state[:, 8] = np.linspace(0, 1, frames) + offset
+    return state
+
+
+def test_errors_of_a_known_offset() -> None:
+    same = trajectory_error(straight(50), straight(50))
+    assert same.position.max() == 0.0
+    assert same.angle.max() == 0.0
+    assert same.dtw == 0.0
+    moved = trajectory_error(straight(50, 0.02), straight(50))
+    np.testing.assert_allclose(moved.position, 0.02)
+    # Warping forgives what is merely late.
+    late = np.concatenate([straight(50)[:1].repeat(5, 0), straight(50)])
+    assert trajectory_error(late, straight(50)).dtw < 1e-9
+    turned = straight(50)
+    turned[:, 3:7] = [np.sin(0.05), 0, 0, np.cos(0.05)]
+    np.testing.assert_allclose(trajectory_error(turned, straight(50)).angle, 0.05)  # one hand of two by 0.1 rad
+
+
+@pytest.fixture(scope="module")
+def played() -> tuple[BimanualEnv, Trace, Outcome]:
+    """The expert's episode of a seed, judged against itself."""
+    env = BimanualEnv("table_lift")
+    trace = demonstrate_trace(env, Demonstrator(env.task_spec, Noise(0.0)), 940_000)
+    return env, trace, judge(env.task_spec, 940_000, trace, trace, True, "")
+
+
+def test_the_expert_has_no_error_against_itself(played) -> None:
+    env, trace, outcome = played
+    assert outcome.position_error_cm == 0.0
+    assert outcome.primitives == tuple(p.name for p in env.task_spec.primitives)
+    assert set(outcome.position_error_cm_by_primitive) == set(env.task_spec.labels)
+    assert trace.state.shape == (71, 16)
+    assert trace.joints.shape == (71, 18)
+
+
+def read_back(path: Path) -> str:
+    rerun = Path(sys.executable).with_name("rerun")
+    subprocess.run([rerun, "rrd", "verify", str(path)], check=True, capture_output=True)
+    return subprocess.run([rerun, "rrd", "print", "-vvv", str(path)], check=True, capture_output=True, text=True).stdout
+
+
+def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path: Path) -> None:
+    env, trace, outcome = played
+    failed = replace(outcome, success=False, unmet="table at rest")
+    wrong = replace(trace, predicted=np.where(trace.predicted == 2, 1, trace.predicted))
+    path = write_recording(tmp_path, env, failed, wrong, trace)
+    assert path.name == "seed_0940000_failure.rrd"
+    assert recording_name(outcome) == "seed_0940000_success"
+    text = read_back(path)
+    for entity in (
+        "/world/table",
+        "/world/platform",
+        "/world/hands/left/commanded",
+        "/world/hands/right/executed",
+        "/world/hands/left/expert_path",
+        "/robot/joints/left_s0",
+        "/primitive/scripted",
+        "/primitive/predicted",
+        "/tracking_error_mm/left",
+        "/reward",
+        "/summary",
+    ):
+        assert f"entity_path: {entity} " in text, entity
+    assert "failure: table at rest" in text
+    lanes = text.split("entity_path: /primitive/predicted")[1:]
+    assert not any("lift" in lane.split("entity_path:")[0] for lane in lanes)
+    assert any("lift" in lane.split("entity_path:")[0] for lane in text.split("entity_path: /primitive/scripted")[1:])
+
+
+def test_report_says_what_happened(played, tmp_path: Path) -> None:
+    _, _, outcome = played
+    outcomes = [replace(outcome, seed=s, success=s != 5, unmet="" if s != 5 else "table upright") for s in range(10)]
+    run = Run("table_lift", "somewhere", (), 0, 10, True)
+    write_report(tmp_path, run, outcomes)
+    data = json.loads((tmp_path / "results.json").read_text())
+    assert (data["n_success"], data["n_episodes"], data["pc_success"]) == (9, 10, 90.0)
+    assert data["pc_success_ci95"] == pytest.approx([100 * v for v in wilson_interval(9, 10)])
+    assert data["pc_expert_order"] == 100.0
+    assert "9 of 10 succeeded: 90.0 %" in headline(data)
+    text = (tmp_path / "report.md").read_text()
+    assert "table upright (1)" in text
+    assert "| 5 | table upright |" in text
+    assert (tmp_path / "report.png").stat().st_size > 10_000
+
+
+def test_seeds_of_the_training_data_are_refused(dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "train_config.json").write_text(json.dumps({"dataset": {"repo_id": "hdril/test", "root": str(dataset)}}))
+    provenance = training_provenance(str(tmp_path))
+    assert provenance is not None
+    assert provenance.seeds == (0, 1, 2, 3, 4, 5)
+    assert check_held_out(provenance, "table_lift", [6, 7])
+    with pytest.raises(ValueError, match="2 of 4 seeds .4 to 5. were in the training data.*a seed above 5"):
+        check_held_out(provenance, "table_lift", [4, 5, 6, 7])
+    with pytest.raises(ValueError, match="trained on the task 'table_lift', not on 'other'"):
+        check_held_out(Provenance(Recipe("table_lift"), (0,)), "other", [9])
+    assert not check_held_out(training_provenance("user/elsewhere"), "table_lift", [0])

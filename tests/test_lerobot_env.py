@@ -1,0 +1,101 @@
+"""The tasks in LeRobot's hands: registration, vector environments, and the same outcome however they are batched."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from hdril.demonstrator import Demonstrator
+from hdril.lerobot_env import HDRILEnvConfig
+from hdril.primitives import Noise
+from hdril.tasks import TASKS, get_task
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.envs.configs import EnvConfig
+from lerobot.envs.factory import make_env
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.processor import PolicyProcessorPipeline
+from lerobot.scripts.lerobot_eval import eval_policy
+from lerobot_policy_hdril import HDRILConfig
+
+
+class Scripted(PreTrainedPolicy):
+    """The expert as a LeRobot policy, from observations alone. It never closes its hands on what starts to the left."""
+
+    config_class = HDRILConfig  # pyright: ignore
+    name = "scripted"  # pyright: ignore
+
+    def __init__(self, task: str) -> None:
+        super().__init__(HDRILConfig(device="cpu", push_to_hub=False))
+        self.task = get_task(task)
+        self.dummy = torch.nn.Parameter(torch.zeros(1))
+        self.experts: list[tuple[Demonstrator, bool]] = []
+
+    def reset(self) -> None:
+        self.experts = []
+
+    def select_action(self, batch, **kwargs) -> torch.Tensor:
+        states, objects = batch["observation.state"].numpy(), batch["observation.environment_state"].numpy()
+        if not self.experts:
+            self.experts = [(Demonstrator(self.task, Noise(0.0)), row[1] > 0.0) for row in objects]
+        actions = []
+        for (expert, spoiled), state, row in zip(self.experts, states, objects, strict=True):
+            action = expert.act({"agent_pos": state, "environment_state": row}).action
+            if spoiled:
+                action[[7, 15]] = 1.0
+            actions.append(torch.from_numpy(action))
+        return torch.stack(actions).float()
+
+    def forward(self, batch):
+        raise RuntimeError("not for training")
+
+    def get_optim_params(self):
+        return self.parameters()
+
+    def predict_action_chunk(self, batch, **kwargs):
+        return self.select_action(batch)[:, None]
+
+
+def outcomes(task: str, n_envs: int, use_async: bool, episodes: int) -> dict[int, bool]:
+    """Success by seed, from LeRobot's own evaluation loop."""
+    vector = make_env(HDRILEnvConfig(task=task), n_envs=n_envs, use_async_envs=use_async)["hdril"][0]
+    around_env = [PolicyProcessorPipeline(steps=[]) for _ in range(2)]
+    around_policy = [lambda data: data] * 2
+    with closing(vector):
+        info = eval_policy(vector, Scripted(task), *around_env, *around_policy, n_episodes=episodes, start_seed=930_000)
+    return {row["seed"]: row["success"] for row in info["per_episode"]}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_same_outcomes_for_one_several_and_asynchronous_environments(task: str) -> None:
+    one = outcomes(task, 1, False, 6)
+    assert set(one.values()) == {True, False}, "the seeds should hold both outcomes"
+    assert outcomes(task, 3, False, 6) == one
+    assert outcomes(task, 2, True, 6) == one
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_gym_id_makes_the_task(task: str) -> None:
+    env = gym.make(get_task(task).gym_id, disable_env_checker=True)
+    assert env.unwrapped.task == task  # pyright: ignore
+    env.close()
+
+
+def test_types_are_registered() -> None:
+    assert EnvConfig.get_choice_class("hdril") is HDRILEnvConfig
+    assert PreTrainedConfig.get_choice_class("hdril") is HDRILConfig
+
+
+def test_unknown_task_is_named() -> None:
+    with pytest.raises(ValueError, match=r"unknown task 'chess'; choose from: .*table_lift"):
+        HDRILEnvConfig(task="chess")
+
+
+def test_videos_can_be_drawn() -> None:
+    vector = make_env(HDRILEnvConfig(task="table_lift"), n_envs=1)["hdril"][0]
+    with closing(vector):
+        vector.reset(seed=[0])
+        (frame,) = vector.call("render")
+        assert np.asarray(frame).shape == (240, 320, 3)
