@@ -104,7 +104,7 @@ def test_lerobots_own_policies_train_and_evaluate(policy: str, options: list, da
     ("arguments", "message"),
     [
         (["hdril-record", "--repo_id=a/b", "--task=chess"], "unknown task 'chess'; choose from: "),
-        (["hdril-record", "--repo_id=a/b", "--num_episodes=0"], "num_episodes must be at least 1, got 0"),
+        (["hdril-record", "--repo-id=a/b", "--num-episodes=0"], "num_episodes must be at least 1, got 0"),
         (["hdril-record", "--repo_id=nameless"], "repo_id must look like user/name, got 'nameless'"),
         (["hdril-record", "--repo_id=a/b", "--noise.waypoint=1"], "noise.waypoint must be from 0 to 0.02 m"),
         (["hdril-record", "--repo_id=a/b", "--colour=red"], "--colour"),
@@ -135,7 +135,9 @@ def test_help(command: str) -> None:
 def test_ctrl_c_stops_cleanly_and_the_same_command_goes_on(tmp_path: Path) -> None:
     root = tmp_path / "set"
     command = [str(BIN / "hdril-record"), "--repo_id=a/b", f"--root={root}", "--num_episodes=4", "--workers=2"]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
     deadline = time.monotonic() + 120
     while not list(tmp_path.glob("set.partial/*.npz")) and time.monotonic() < deadline:
         time.sleep(0.1)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from hdril.demonstrator import Demonstrator
 from hdril.env import BimanualEnv
 from hdril.evaluation import Outcome, Trace, check_held_out, demonstrate_trace, judge, training_provenance
@@ -123,12 +124,14 @@ def test_report_says_what_happened(played, tmp_path: Path) -> None:
 
 
 def test_seeds_of_the_training_data_are_refused(dataset: Path, tmp_path: Path) -> None:
-    (tmp_path / "train_config.json").write_text(json.dumps({"dataset": {"repo_id": "hdril/test", "root": str(dataset)}}))
+    (tmp_path / "train_config.json").write_text(
+        json.dumps({"dataset": {"repo_id": "hdril/test", "root": str(dataset)}})
+    )
     provenance = training_provenance(str(tmp_path))
     assert provenance is not None
     assert provenance.seeds == (0, 1, 2, 3, 4, 5)
     assert check_held_out(provenance, "table_lift", [6, 7])
-    with pytest.raises(ValueError, match="2 of 4 seeds .4 to 5. were in the training data.*a seed above 5"):
+    with pytest.raises(ValueError, match=r"2 of 4 seeds \(4 to 5\) were in the training data.*a seed above 5"):
         check_held_out(provenance, "table_lift", [4, 5, 6, 7])
     with pytest.raises(ValueError, match="trained on the task 'table_lift', not on 'other'"):
         check_held_out(Provenance(Recipe("table_lift"), (0,)), "other", [9])

@@ -8,10 +8,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from hdril.demonstrator import Demonstrator
-from hdril.lerobot_env import HDRILEnvConfig
-from hdril.primitives import Noise
-from hdril.tasks import TASKS, get_task
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.factory import make_env
@@ -19,6 +15,11 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.processor import PolicyProcessorPipeline
 from lerobot.scripts.lerobot_eval import eval_policy
 from lerobot_policy_hdril import HDRILConfig
+
+from hdril.demonstrator import Demonstrator
+from hdril.lerobot_env import HDRILEnvConfig
+from hdril.primitives import Noise
+from hdril.tasks import TASKS, get_task
 
 
 class Scripted(PreTrainedPolicy):

@@ -7,16 +7,17 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import hdril.recording as recording
 import numpy as np
 import pandas as pd
 import pytest
+from lerobot.datasets import LeRobotDataset
+
+import hdril.recording as recording
 from hdril.control import ACTION_NAMES
 from hdril.demonstrator import Demonstrator
 from hdril.primitives import Noise
 from hdril.recording import Episode, Recipe, demonstrate, episodes, read_provenance, record, write_dataset
 from hdril.tasks import TASKS
-from lerobot.datasets import LeRobotDataset
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +183,9 @@ def test_rerun_shows_the_primitives_as_text(dataset: Path, tmp_path: Path) -> No
     out = tmp_path / "dataset.rrd"
     rerun = Path(sys.executable).with_name("rerun")
     subprocess.run([rerun, str(dataset), "--save", str(out)], check=True, capture_output=True, timeout=120)
-    text = subprocess.run([rerun, "rrd", "print", "-vvv", str(out)], check=True, capture_output=True, timeout=120).stdout
+    text = subprocess.run(
+        [rerun, "rrd", "print", "-vvv", str(out)], check=True, capture_output=True, timeout=120
+    ).stdout
     for name in TASKS["table_lift"].labels:
         assert name.encode() in text, name
 

@@ -15,8 +15,10 @@ from hdril.conditions import ROBOT
 from hdril.demonstrator import Demonstrator
 from hdril.env import BimanualEnv
 from hdril.geometry import Pose
+from hdril.kinematics import Chain
 from hdril.robots import SIDES
 from hdril.tasks import TASKS, get_task
+from hdril.world import World
 
 pytestmark = pytest.mark.parametrize("task", TASKS)
 
@@ -191,6 +193,22 @@ def test_the_arms_collide_with_each_other(env: BimanualEnv, task: str) -> None:
         touched |= bool(env.world.contacts(ROBOT, ROBOT))
     assert touched
     assert np.linalg.norm(observation["agent_pos"][:3] - observation["agent_pos"][8:11]) > 0.03
+
+
+def test_an_arm_collides_with_the_torso(env: BimanualEnv) -> None:
+    """An arm that is put into the torso is pushed out of it."""
+    robot, torso = env.robot_spec, np.array([0.0, 0.0, 0.3])
+    rng, arm = np.random.default_rng(0), env.robot_spec.arms["left"]
+    chain = Chain(robot.source(), robot.base_link, arm.tool)
+    candidates = (rng.uniform(chain.lower, chain.upper) for _ in range(20_000))
+    q = next(q for q in candidates if np.abs(chain.forward(q).position - torso).max() < 0.12)
+    with closing(World()) as world:
+        world.add_urdf(ROBOT, robot.urdf(False), robot.base, self_collision=True)
+        world.ignore_collisions(ROBOT, robot.ignored_collisions(world.links(ROBOT)))
+        world.reset_joints(ROBOT, arm.joints, q.tolist())
+        world.step()
+        touching = {frozenset((contact.link_a, contact.link_b)) for contact in world.contacts(ROBOT, ROBOT)}
+    assert any("torso" in pair for pair in touching), touching
 
 
 def test_pictures_show_the_scene(env: BimanualEnv) -> None:

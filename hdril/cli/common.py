@@ -13,6 +13,12 @@ import draccus
 EXPECTED = (ValueError, FileExistsError, FileNotFoundError, NotADirectoryError, KeyError, RuntimeError)
 
 
+def _with_underscores(argument: str) -> str:
+    """``--num-episodes=5`` as ``--num_episodes=5``: LeRobot's own commands are of two minds."""
+    name, equals, value = argument.partition("=")
+    return (name[:2] + name[2:].replace("-", "_") + equals + value) if name.startswith("--") else argument
+
+
 def run(program: str, config_class: type[Any], command: Callable[[Any], None]) -> None:
     """Parse the command line and run ``command``; a failure that a user can mend is one line and exit code 2.
 
@@ -20,7 +26,7 @@ def run(program: str, config_class: type[Any], command: Callable[[Any], None]) -
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     try:
-        command(draccus.parse(config_class, args=sys.argv[1:]))
+        command(draccus.parse(config_class, args=[_with_underscores(argument) for argument in sys.argv[1:]]))
     except KeyboardInterrupt:
         print(f"\n{program}: interrupted", file=sys.stderr)
         sys.exit(130)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hdril.control import ACTION_NAMES
-from hdril.geometry import Pose
 from lerobot_policy_hdril.graph import feature_names, group_nodes, pose_columns, quaternion_groups
 from lerobot_policy_hdril.interaction import INTERACTIONS, make_interaction
 from scipy.spatial.transform import Rotation
+
+from hdril.control import ACTION_NAMES
+from hdril.geometry import Pose
 
 NAMES = [*ACTION_NAMES, *(f"table.{axis}" for axis in ("x", "y", "z", "qx", "qy", "qz", "qw"))]
 

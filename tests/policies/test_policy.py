@@ -16,7 +16,14 @@ from lerobot.policies.factory import make_policy
 from lerobot_policy_hdril import HDRILConfig, HDRILPolicy
 from lerobot_policy_hdril.demonstrations import Demonstrations
 
-SMALL = {"device": "cpu", "push_to_hub": False, "hidden_dim": 32, "node_dim": 8, "planner_hidden_dim": 16, "optimizer_lr": 1e-2}
+SMALL = {
+    "device": "cpu",
+    "push_to_hub": False,
+    "hidden_dim": 32,
+    "node_dim": 8,
+    "planner_hidden_dim": 16,
+    "optimizer_lr": 1e-2,
+}
 VARIANTS = {
     "HDR-IL": {},
     "GRU-GRU": {"interaction": "none", "skip": False, "per_primitive": False, "state_skip": False},
@@ -76,9 +83,7 @@ def test_variant_learns_saves_loads_and_runs(variant: str, metadata, tmp_path: P
 def test_batched_and_single_give_the_same_actions(variant: str, metadata) -> None:
     policy = build(metadata, **VARIANTS[variant]).eval()
     frames = [0, 70, 140]
-    together = []
-    for t in range(25):
-        together.append(policy.select_action(observation(metadata, [frame + t for frame in frames])))
+    together = [policy.select_action(observation(metadata, [frame + t for frame in frames])) for t in range(25)]
     for i, frame in enumerate(frames):
         policy.reset()
         for t in range(25):
@@ -220,7 +225,9 @@ def test_checkpoint_of_another_task(copy: Path, metadata, tmp_path: Path) -> Non
     names.to_parquet(copy / "meta/subtasks.parquet")
     config = HDRILConfig.from_pretrained(tmp_path / "checkpoint")
     config.pretrained_path = tmp_path / "checkpoint"
-    with pytest.raises(ValueError, match=r"trained on another task: its primitives are .*place.*; the dataset's are .*stack"):
+    with pytest.raises(
+        ValueError, match=r"trained on another task: its primitives are .*place.*; the dataset's are .*stack"
+    ):
         make_policy(config, ds_meta=LeRobotDatasetMetadata("hdril/test", root=copy))
 
 
