@@ -9,7 +9,7 @@ READY := $(VENV)/.ready
 DEMO := outputs/demo
 export HF_HUB_OFFLINE ?= 1
 
-.PHONY: help setup demo test test-long bench lint lock clean
+.PHONY: help setup demo test test-long bench lint types lock clean
 
 help: ## What there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -40,8 +40,11 @@ test-long: $(READY) ## The tests that take longer
 bench: $(READY) ## Speeds, as ratios within one run
 	$(BIN)/hdril-bench
 
-lint: $(READY) ## Formatting, lint and types
-	$(BIN)/ruff format --check . && $(BIN)/ruff check . && $(BIN)/pyright
+lint: $(READY) ## Formatting and lint
+	$(BIN)/ruff format --check . && $(BIN)/ruff check .
+
+types: $(READY) ## Types (pyright fetches Node where there is none)
+	$(BIN)/pyright
 
 lock: $(READY) ## Pin the environment anew
 	$(UV) pip compile --quiet pyproject.toml --group dev --universal --generate-hashes --no-emit-index-url \

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import closing, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -371,8 +371,3 @@ def read_provenance(root: Path) -> Provenance | None:
         values = json.loads(path.read_text())
         return Provenance(Recipe.from_dict(values["recipe"]), tuple(values["seeds"]))
     return None
-
-
-def noiseless(recipe: Recipe) -> Recipe:
-    """The same scenes, demonstrated without noise."""
-    return replace(recipe, noise=Noise(0.0))

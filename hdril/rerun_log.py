@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from hdril.evaluation import Outcome, Trace
 
 TIMELINE = "time"
-WORLD_FRAME = "world"
+WORLD_FRAME = "tf#/world"  # the frame that Rerun gives the entity "world"; the robot's own frames hang below it
 COLOURS = {
     "executed": ((40, 110, 220), (220, 90, 30)),
     "commanded": ((150, 190, 250), (250, 190, 150)),
@@ -70,7 +70,6 @@ def _send_poses(
 
 def _log_scene(stream: rr.RecordingStream, env: BimanualEnv) -> None:
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    stream.log("world", rr.CoordinateFrame(WORLD_FRAME), static=True)
     for body in env.task_spec.bodies:
         stream.log(
             f"world/{body.name}/shape",

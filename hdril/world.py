@@ -263,11 +263,6 @@ class World:
         states = bullet.getJointStates(self._ids[body], indices, physicsClientId=self._client)
         return np.array([state[0] for state in states])
 
-    def joint_efforts(self, body: str, indices: Sequence[int]) -> NDArray[np.float64]:
-        """(len(indices),), Nm or N: what the motors applied in the last timestep."""
-        states = bullet.getJointStates(self._ids[body], indices, physicsClientId=self._client)
-        return np.array([state[3] for state in states])
-
     def link_pose(self, body: str, link: str) -> Pose:
         """Frame of a link, as the URDF has it."""
         state = self._call("getLinkState", self._id(body), self._link(body, link), computeForwardKinematics=1)

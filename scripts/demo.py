@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shlex
 import shutil
 import subprocess
@@ -24,16 +25,20 @@ class Stage:
     title: str
     command: tuple[str, ...]
     result: Path
+    threads: int | None = None
+    """Threads of PyTorch; as many as it likes unless given."""
 
     def run(self) -> float:
         """Seconds it took; 0 if it was done before."""
-        print(f"\n== {self.title}\n$ {shlex.join(self.command)}", flush=True)
+        variables = {} if self.threads is None else {"OMP_NUM_THREADS": str(self.threads)}
+        prefix = "".join(f"{name}={value} " for name, value in variables.items())
+        print(f"\n== {self.title}\n$ {prefix}{shlex.join(self.command)}", flush=True)
         if self.result.exists():
             print(f"done before: {self.result}")
             return 0.0
         start = time.monotonic()
         program = Path(sys.executable).with_name(self.command[0])
-        subprocess.run([program, *self.command[1:]], check=True)
+        subprocess.run([program, *self.command[1:]], check=True, env=os.environ | variables)
         return time.monotonic() - start
 
 
@@ -53,6 +58,7 @@ def stages(output: Path, episodes: int, steps: int, evaluations: int) -> list[St
             ("lerobot-train", "--config_path=configs/train/table_lift.yaml", f"--dataset.root={dataset}",
              f"--output_dir={train}", f"--steps={steps}", f"--save_freq={steps}"),
             train / "checkpoints" / f"{steps:06d}" / "pretrained_model" / "model.safetensors",
+            threads=1,  # the matrices are small: a second thread slows them down
         ),
         Stage(
             "evaluation with LeRobot's own command, 10 episodes",

@@ -63,9 +63,6 @@ class Task:
         """Names of the primitives, each once, in the order of their first use: a label is an index into this."""
         return tuple(dict.fromkeys(primitive.name for primitive in self.primitives))
 
-    def find(self, name: str) -> BodySpec:
-        return next(body for body in self.bodies if body.name == name)
-
 
 def fixed(position: Sequence[float]) -> Uniform:
     """A placement that does not vary."""
