@@ -91,9 +91,9 @@ def _log_scene(stream: rr.RecordingStream, env: BimanualEnv) -> None:
 
 
 def _log_robot(stream: rr.RecordingStream, env: BimanualEnv, trace: Trace, times: NDArray[np.floating]) -> None:
-    """The robot's own meshes, moved joint by joint."""
+    """The robot as the simulation has it, shapes that collide and no meshes: 16 MB less in every file."""
     spec = env.robot_spec
-    tree = rr.urdf.UrdfTree.from_file_path(spec.urdf(True), entity_path_prefix="robot")
+    tree = rr.urdf.UrdfTree.from_file_path(spec.urdf(False), entity_path_prefix="robot")
     tree.log_urdf_to_recording(stream)
     base: Pose = spec.base
     stream.log(
@@ -182,7 +182,7 @@ def _blueprint(env: BimanualEnv) -> rrb.Blueprint:
             rrb.Vertical(
                 rrb.Spatial3DView(
                     origin="world",
-                    contents=["world/**", "robot/**"],
+                    contents=["+ /world/**", "+ /robot/**", f"- /robot/{env.robot_spec.name}/collision_geometries/**"],
                     name=env.task,
                     eye_controls=rrb.EyeControls3D(
                         position=env.task_spec.camera.eye, look_target=env.task_spec.camera.target

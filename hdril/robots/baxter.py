@@ -88,7 +88,7 @@ def _prepare(link: ElementTree.Element, meshes: bool) -> None:
         link.remove(shape)
     for shape in link.findall("collision"):
         visual = ElementTree.SubElement(link, "visual")
-        visual.extend(list(shape))
+        visual.extend(part for part in shape if part.tag in ("origin", "geometry"))
         material = ElementTree.SubElement(visual, "material", {"name": "baxter"})
         ElementTree.SubElement(
             material, "color", {"rgba": "0.55 0.13 0.13 1" if "finger" not in name else "0.2 0.2 0.2 1"}
