@@ -38,7 +38,7 @@ class EvalConfig:
 
     policy: PolicySource
     task: str = "table_lift"
-    """Task: table_lift."""
+    """Name of the task; an unknown one is answered with those there are."""
     num_episodes: int = 100
     """Episodes, one a seed."""
     seed: int = 100_000

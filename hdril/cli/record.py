@@ -24,7 +24,7 @@ class RecordConfig:
     repo_id: str
     """Name of the dataset, as user/name."""
     task: str = "table_lift"
-    """Task: table_lift."""
+    """Name of the task; an unknown one is answered with those there are."""
     num_episodes: int = 100
     """Successful episodes to record."""
     seed: int = 0

@@ -1,9 +1,24 @@
-"""Tasks by name. To add one: a file here that builds a :class:`~hdril.tasks.task.Task`, and its name in ``TASKS``."""
+"""Tasks by name. To add one, add a module here that defines ``TASK``: it is found by itself."""
 
-from hdril.tasks.table_lift import TABLE_LIFT
+from importlib import import_module
+from pkgutil import iter_modules
+
 from hdril.tasks.task import Task, Uniform, fixed
 
-TASKS: dict[str, Task] = {task.name: task for task in (TABLE_LIFT,)}
+
+def _discover() -> dict[str, Task]:
+    tasks: dict[str, Task] = {}
+    for module in iter_modules(__path__):
+        task = getattr(import_module(f"{__name__}.{module.name}"), "TASK", None)
+        if task is None:
+            continue
+        if task.name in tasks:
+            raise ValueError(f"two tasks are named {task.name!r}")
+        tasks[task.name] = task
+    return tasks
+
+
+TASKS: dict[str, Task] = _discover()
 
 
 def get_task(name: str) -> Task:

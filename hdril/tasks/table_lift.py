@@ -43,7 +43,7 @@ PLATFORM = BodySpec("platform", (Box((0.30, 0.90, PLATFORM_HEIGHT), (0.0, 0.0, P
 _PITCH = Rotation.from_matrix(np.array([[-1, 0, 1], [0, np.sqrt(2), 0], [-1, 0, -1]]) / np.sqrt(2)).as_quat()
 GRIPS = {side: Pose((0.0, y, GRIP_HEIGHT), _PITCH) for side, y in (("left", HANDLE_Y), ("right", -HANDLE_Y))}
 
-TABLE_LIFT = Task(
+TASK = Task(
     name="table_lift",
     gym_id="hdril/TableLift-v0",
     description="Lift the table with both hands and set it down upright on the platform.",
