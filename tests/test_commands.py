@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -76,6 +77,21 @@ def test_hdril_evaluates_with_both_commands(checkpoint: Path, tmp_path: Path) ->
     assert done.returncode == 2
     assert "were in the training data" in done.stderr
     assert not (tmp_path / "no").exists()
+
+
+def test_an_action_that_is_not_finite_is_named(checkpoint: Path, tmp_path: Path) -> None:
+    from safetensors.torch import load_file, save_file
+
+    broken = Path(shutil.copytree(checkpoint, tmp_path / "broken"))
+    weights = load_file(broken / "model.safetensors")
+    weights["output_mean"][0] = float("nan")
+    save_file(weights, broken / "model.safetensors")
+    done = call(
+        "hdril-eval", f"--policy.path={broken}", "--seed=200000", "--workers=2", f"--output_dir={tmp_path / 'out'}"
+    )
+    assert done.returncode == 2
+    assert done.stderr.strip().splitlines()[-1] == "hdril-eval: error: the action is not finite: left_ee.x = nan"
+    assert list(tmp_path.iterdir()) == [broken]
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sys
 import time
 from contextlib import closing
@@ -86,17 +87,12 @@ def eval_command(config: EvalConfig, overrides: tuple[str, ...] = ()) -> None:
     start = time.monotonic()
     outcomes = [done[seed] for seed in seeds if seed in done]
     left = [seed for seed in seeds if seed not in done]
-    with (
-        (partial / "outcomes.jsonl").open("a") as journal,
-        tqdm(total=len(seeds), initial=len(outcomes), desc=f"evaluating {config.task}", unit="episode") as bar,
-        closing(evaluate(job, left, min(config.workers, max(len(left), 1)))) as stream,
-    ):
-        for outcome in stream:
-            journal.write(json.dumps(asdict(outcome)) + "\n")
-            journal.flush()
-            outcomes.append(outcome)
-            bar.set_postfix(success=f"{100 * sum(o.success for o in outcomes) / len(outcomes):.1f}%", refresh=False)
-            bar.update()
+    try:
+        _play(job, left, min(config.workers, max(len(left), 1)), outcomes, partial / "outcomes.jsonl")
+    except Exception:
+        if not outcomes:  # nothing to go on from
+            shutil.rmtree(partial)
+        raise
     outcomes.sort(key=lambda outcome: outcome.seed)
     summary = write_report(partial, what, outcomes)
     (partial / "run.json").unlink()
@@ -108,6 +104,23 @@ def eval_command(config: EvalConfig, overrides: tuple[str, ...] = ()) -> None:
     print(f"Report: {output / 'report.md'}")
     if recordings:
         print(f"{len(recordings)} recordings: rerun {recordings[0]}")
+
+
+def _play(job: Job, seeds: list[int], workers: int, outcomes: list[Outcome], journal: Path) -> None:
+    """Evaluate ``seeds``, adding to ``outcomes`` and to the journal as they come."""
+    with (
+        journal.open("a") as file,
+        tqdm(
+            total=len(seeds) + len(outcomes), initial=len(outcomes), desc=f"evaluating {job.task}", unit="episode"
+        ) as bar,
+        closing(evaluate(job, seeds, workers)) as stream,
+    ):
+        for outcome in stream:
+            file.write(json.dumps(asdict(outcome)) + "\n")
+            file.flush()
+            outcomes.append(outcome)
+            bar.set_postfix(success=f"{100 * sum(o.success for o in outcomes) / len(outcomes):.1f}%", refresh=False)
+            bar.update()
 
 
 def _resume(partial: Path, what: Run) -> dict[int, Outcome]:

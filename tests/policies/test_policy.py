@@ -104,14 +104,14 @@ def test_windows_are_what_the_dataset_says(metadata) -> None:
     data = pd.read_parquet(Path(metadata.root) / "data")
     demonstrations = Demonstrations(metadata, "subtask_index", "cpu")
     rows = torch.tensor([15, 70 + 69, 200])
-    window = demonstrations.window(rows, stride=0)
+    window = demonstrations.window(rows, stride=0, length=12)
     assert window.primitive.tolist() == [1, 5, 5]
     assert window.elapsed.tolist() == [0, 0, 0]
     torch.testing.assert_close(window.state[0, :16], torch.tensor(data["observation.state"][10]))
     torch.testing.assert_close(window.target[0, 3, :16], torch.tensor(data["action"][13]))
     torch.testing.assert_close(window.target[0, 3, 32:], torch.tensor(data["observation.environment_state"][14]))
     assert window.mask.sum(1).tolist() == [12, 12, 12]
-    within = demonstrations.window(rows, stride=4)
+    within = demonstrations.window(rows, stride=4, length=12)
     assert within.elapsed.tolist() == [4, 8, 0]
     assert within.mask.sum(1).tolist() == [8, 4, 12]
     torch.testing.assert_close(within.target[0, 0, :16], torch.tensor(data["action"][14]))
@@ -152,7 +152,7 @@ def test_open_loop_does_not_look(metadata) -> None:
 
 def test_padding_does_not_count(metadata) -> None:
     policy = build(metadata)
-    window = policy._demonstrations.window(torch.tensor([5, 15]), 0)  # pyright: ignore
+    window = policy._demonstrations.window(torch.tensor([5, 15]), 0, 12)  # pyright: ignore
     assert window.mask[0].sum() == 10
     before = policy._dynamics_loss(window)
     window.target[0, 10:] += 100.0
@@ -229,6 +229,19 @@ def test_checkpoint_of_another_task(copy: Path, metadata, tmp_path: Path) -> Non
         ValueError, match=r"trained on another task: its primitives are .*place.*; the dataset's are .*stack"
     ):
         make_policy(config, ds_meta=LeRobotDatasetMetadata("hdril/test", root=copy))
+
+
+def test_fine_tuning_on_shorter_and_longer_primitives(metadata, tmp_path: Path) -> None:
+    policy = build(metadata)
+    policy.config.primitive_lengths[1] = [9, 20]
+    policy.config.learn_primitives(policy.config.primitives, [[10, 10]] * 6)
+    with pytest.raises(ValueError, match="predicts 20 frames at most, but a primitive of the dataset has 30"):
+        policy.config.learn_primitives(policy.config.primitives, [[30, 30]] * 6)
+    policy.save_pretrained(tmp_path)
+    config = HDRILConfig.from_pretrained(tmp_path)
+    longer = make_policy(config, ds_meta=metadata)
+    loss, _ = longer.forward({"index": torch.arange(0, 420, 9)})
+    assert torch.isfinite(loss)
 
 
 def test_observation_of_another_task(metadata) -> None:

@@ -123,11 +123,16 @@ class HDRILConfig(PreTrainedConfig):
         """Keep the dataset's primitives and their lengths.
 
         Raises:
-            ValueError: the checkpoint knows other primitives: the dataset is of another task.
+            ValueError: the checkpoint knows other primitives, or shorter ones: the dataset is of another task.
         """
         self._learn("primitives", primitives)
         if not self.primitive_lengths:
             self.primitive_lengths = lengths
+        known, given = max(run[1] for run in self.primitive_lengths), max(run[1] for run in lengths)
+        if given > known:
+            raise ValueError(
+                f"the checkpoint predicts {known} frames at most, but a primitive of the dataset has {given}"
+            )
 
     def _learn(self, name: str, value: list[str]) -> None:
         known = getattr(self, name)

@@ -102,7 +102,6 @@ class Demonstrations:
         self._segment_bounds = self._bounds(new_segment, device)  # (segments, 2)
         self._episode_bounds = self._bounds(new_episode, device)  # (episodes, 2)
         self.lengths = self._lengths()
-        self.longest = max(longest for _, longest in self.lengths)
 
     index: Tensor
     state: Tensor
@@ -142,14 +141,14 @@ class Demonstrations:
             raise ValueError("the batch holds frames that the dataset on disk does not have")
         return rows
 
-    def window(self, rows: Tensor, stride: int) -> Window:
-        """Windows that the frames belong to. They start where the rollout looks: every ``stride`` frames of a primitive,
-        or at its start alone if ``stride`` is 0."""
+    def window(self, rows: Tensor, stride: int, length: int) -> Window:
+        """Windows of ``length`` frames that the frames belong to. They start where the rollout looks: every ``stride``
+        frames of a primitive, or at its start alone if ``stride`` is 0."""
         bounds = self._segment_bounds[self.segment[rows]]
         first, end = bounds.unbind(-1)
         elapsed = torch.div(rows - first, stride, rounding_mode="floor") * stride if stride else torch.zeros_like(rows)
         start = first + elapsed
-        steps = start[:, None] + torch.arange(self.longest, device=rows.device)  # (B, M)
+        steps = start[:, None] + torch.arange(length, device=rows.device)  # (B, M)
         mask = steps < end[:, None]
         steps = torch.minimum(steps, end[:, None] - 1)
         # The last frame of an episode leads to a state that was not recorded: its own stands in.

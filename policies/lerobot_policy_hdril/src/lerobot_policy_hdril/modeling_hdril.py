@@ -165,7 +165,7 @@ class HDRILPolicy(PreTrainedPolicy):
         if self._demonstrations is None:
             raise RuntimeError("this policy was loaded without a dataset: train it with lerobot-train")
         rows = self._demonstrations.rows(batch["index"].flatten())
-        dynamics_loss = self._dynamics_loss(self._demonstrations.window(rows, self.config.replan_every))
+        dynamics_loss = self._dynamics_loss(self._demonstrations.window(rows, self.config.replan_every, self.longest))
         planner_loss, accuracy = self._planner_loss(
             self._demonstrations.history(rows[: self.config.planner_batch_size])
         )
