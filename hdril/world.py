@@ -92,9 +92,9 @@ class Contact:
 class Camera:
     """A pinhole camera for pictures: eye and target in the world frame, m; vertical field of view in degrees."""
 
-    eye: Vector3 = (2.05, -1.25, 1.15)
-    target: Vector3 = (0.62, 0.0, 0.28)
-    field_of_view: float = 46.0
+    eye: Vector3 = (2.15, -1.35, 1.30)
+    target: Vector3 = (0.52, 0.0, 0.40)
+    field_of_view: float = 50.0
     width: int = 320
     height: int = 240
 

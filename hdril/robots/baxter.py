@@ -86,13 +86,13 @@ def _prepare(link: ElementTree.Element, meshes: bool) -> None:
     # Drawing the meshes takes ten times as long as the simple shapes that collide: show those.
     for shape in link.findall("visual"):
         link.remove(shape)
+    # One material a colour: PyBullet gives all links the colour that a name had first.
+    material, colour = ("finger", "0.2 0.2 0.2 1") if "finger" in name else ("arm", "0.55 0.13 0.13 1")
     for shape in link.findall("collision"):
         visual = ElementTree.SubElement(link, "visual")
         visual.extend(part for part in shape if part.tag in ("origin", "geometry"))
-        material = ElementTree.SubElement(visual, "material", {"name": "baxter"})
-        ElementTree.SubElement(
-            material, "color", {"rgba": "0.55 0.13 0.13 1" if "finger" not in name else "0.2 0.2 0.2 1"}
-        )
+        element = ElementTree.SubElement(visual, "material", {"name": material})
+        ElementTree.SubElement(element, "color", {"rgba": colour})
 
 
 def _write_once(text: str, stem: str) -> Path:
