@@ -33,7 +33,13 @@ def run(program: str, config_class: type[Any], command: Callable[[Any], None]) -
     except (*EXPECTED, draccus.utils.DraccusException) as error:
         if os.environ.get("HDRIL_DEBUG"):
             raise
-        # KeyError quotes its message; the first line says it all.
-        message = str(error.args[0] if isinstance(error, KeyError) and error.args else error).strip()
-        print(f"{program}: error: {' '.join(message.split())}", file=sys.stderr)
+        print(f"{program}: error: {_message(error)}", file=sys.stderr)
         sys.exit(2)
+
+
+def _message(error: BaseException) -> str:
+    """What went wrong, on one line. draccus wraps the reason that a config class gives; the reason is what helps."""
+    if isinstance(error, draccus.utils.DraccusException) and isinstance(error.__cause__, EXPECTED):
+        return _message(error.__cause__)
+    text = error.args[0] if isinstance(error, KeyError) and error.args else error  # KeyError quotes its message
+    return " ".join(str(text).split())
