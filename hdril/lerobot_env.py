@@ -21,11 +21,8 @@ for _task in TASKS.values():
 @EnvConfig.register_subclass("hdril")
 @dataclass
 class HDRILEnvConfig(EnvConfig):
-    """``--env.type=hdril --env.task=…``.
-
-    Raises:
-        ValueError: unknown task.
-    """
+    """``--env.type=hdril --env.task=…``. An unknown task is named by :meth:`create_envs`: draccus would swallow the reason
+    of an error that is raised here."""
 
     task: str | None = "table_lift"
     robot: str = "baxter"
@@ -40,7 +37,9 @@ class HDRILEnvConfig(EnvConfig):
     )
 
     def __post_init__(self) -> None:
-        spec = get_task(self.task or "")
+        if self.task not in TASKS:
+            return
+        spec = TASKS[self.task]
         self.features = {
             ACTION: PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),)),
             "agent_pos": PolicyFeature(FeatureType.STATE, (len(ACTION_NAMES),)),
@@ -61,11 +60,12 @@ class HDRILEnvConfig(EnvConfig):
         }
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """One vector environment, as LeRobot wants it.
+        """One vector environment, as LeRobot wants it. Raises ValueError if the task is unknown.
 
         Workers of an asynchronous one get a factory of this module, so that they import it: a gym id alone would not
         be known to them.
         """
+        get_task(self.task or "")
         factories = [partial(make_env, self.task, **self.gym_kwargs)] * n_envs
         same_step = gym.vector.AutoresetMode.SAME_STEP
         if use_async_envs and n_envs > 1:

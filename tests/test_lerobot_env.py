@@ -91,7 +91,7 @@ def test_types_are_registered() -> None:
 
 def test_unknown_task_is_named() -> None:
     with pytest.raises(ValueError, match=r"unknown task 'chess'; choose from: .*table_lift"):
-        HDRILEnvConfig(task="chess")
+        make_env(HDRILEnvConfig(task="chess"))
 
 
 def test_videos_can_be_drawn() -> None:
