@@ -274,12 +274,11 @@ def write_dataset(root: Path, repo_id: str, recipe: Recipe, kept: list[Episode],
     for images in each frame: this is six times as fast and gives the same files.
     """
     import pandas as pd
+    import pyarrow as arrow
     import pyarrow.parquet as parquet
     from lerobot.datasets.compute_stats import compute_episode_stats
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.datasets.feature_utils import get_hf_features_from_features
-
-    from datasets import Dataset
 
     task = get_task(recipe.task)
     metadata = LeRobotDatasetMetadata.create(
@@ -293,7 +292,8 @@ def write_dataset(root: Path, repo_id: str, recipe: Recipe, kept: list[Episode],
     writer, start = None, 0
     for index, episode in enumerate(kept):
         frames = _frames(episode, index, start, metadata.fps)
-        table: Any = Dataset.from_dict(frames, features=columns).with_format("arrow")[:]
+        # Not Dataset.from_dict, which spends 50 ms on a fingerprint of each episode.
+        table = arrow.Table.from_pydict({key: list(frames[key]) for key in columns}, schema=columns.arrow_schema)
         writer = writer or parquet.ParquetWriter(data_path, table.schema)
         writer.write_table(table)
         stats = compute_episode_stats({key: np.asarray(frames[key]) for key in metadata.features}, metadata.features)

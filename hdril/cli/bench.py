@@ -112,8 +112,9 @@ def bench_action(root: Path, task: str) -> Figure:
         for _ in range(horizon):
             policy.select_action(batch)
 
-    episode()
-    best = min(_seconds(episode) for _ in range(5))
+    with torch.inference_mode():  # as LeRobot calls it
+        episode()
+        best = min(_seconds(episode) for _ in range(5))
     return Figure("one action, amortised over an episode", 1e3 * best / horizon, 2.0, False, "ms")
 
 

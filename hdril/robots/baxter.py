@@ -39,6 +39,7 @@ ARM_JOINTS = ("s0", "s1", "e0", "e1", "w0", "w1", "w2")
 FINGER_STROKE = 0.020833
 
 
+@cache
 def source_urdf() -> Path:
     """The URDF as the package ships it.
 

@@ -228,7 +228,8 @@ class HDRILPolicy(PreTrainedPolicy):
         Raises:
             ValueError: an observation of another shape than the policy learned.
         """
-        self.eval()
+        if self.training:  # walking all modules costs as much as the planner
+            self.eval()
         rollout = self._advance(self._state(batch))
         ahead = (rollout.elapsed - rollout.plan_start)[:, None] + torch.arange(self.longest, device=rollout.plan.device)
         chunk = rollout.plan[..., : len(self.config.action_names)]
