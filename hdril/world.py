@@ -102,7 +102,7 @@ class Camera:
 class World:
     """A PyBullet world with a robot and bodies, addressed by name.
 
-    Every episode gets a world of its own, which takes 50 ms. To save and restore one state would take less, but what
+    Every episode gets a world of its own, which takes 50 to 100 ms. To save and restore one state would take less, but what
     PyBullet restores differs in the last digits once the robot has touched something, and an episode could not be made
     again bit for bit. Once the world has stepped, nothing here moves a body but :meth:`step`.
     """

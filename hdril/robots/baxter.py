@@ -22,7 +22,7 @@ COLLISION_BOXES = {
     "torso": ((0.22, 0.30, 0.62), (-0.03, 0.0, 0.31)),
     "pedestal": ((0.30, 0.30, 0.68), (-0.10, 0.0, -0.56)),
 }
-# Frames of sensors and bounding spheres: leaves of 0.1 g behind fixed joints. Without them a timestep is a fifth faster.
+# Frames of sensors and bounding spheres: leaves of 0.1 g behind fixed joints. Without them there is less to step.
 # The spheres, 0.22 m around the head for planners that want a wide berth, would also stop the elbows.
 LEFT_OUT = (
     "collision_head_link_1", "collision_head_link_2", "left_torso_itb", "right_torso_itb", "sonar_ring", "dummyhead1",
@@ -32,7 +32,7 @@ LEFT_OUT = (
 )  # fmt: skip
 
 # Hands over the middle of the work area, pitched 45 degrees down. Of 160 random candidates that put them there, the one
-# whose joints stay closest to their speed limits over a grid of both tasks' start areas.
+# whose joints stay closest to their speed limits over a grid of table lift's start area.
 LEFT_POSTURE = (0.278, -0.015, -0.339, 1.959, 0.496, -0.814, 0.700)
 MIRROR = (-1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0)
 ARM_JOINTS = ("s0", "s1", "e0", "e1", "w0", "w1", "w2")
