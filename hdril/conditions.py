@@ -1,4 +1,5 @@
-"""Success, as small conditions that compose. A condition reads the world and says whether it holds."""
+"""Success and progress, as small parts that compose. A condition reads the world and says whether it holds, a measure reads
+a number, and a stage is a step on the way that conditions mark."""
 
 from __future__ import annotations
 
@@ -19,6 +20,22 @@ class Condition:
 
     name: str
     holds: Callable[[World], bool]
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A named number of the world, for logs; ``name`` ends in its unit."""
+
+    name: str
+    read: Callable[[World], float]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A step on the way to success: reached at the first frame at which its conditions hold, after the stages before."""
+
+    name: str
+    conditions: tuple[Condition, ...]
 
 
 def upright(body: str, min_cosine: float = 0.99) -> Condition:
@@ -48,6 +65,19 @@ def touching(body: str, other: str) -> Condition:
 
 def not_touching(body: str, other: str) -> Condition:
     return Condition(f"{body} free of {other}", lambda world: not world.contacts(body, other))
+
+
+def lies_at(body: str, axis: str, position: float, tolerance: float = 0.01) -> Condition:
+    """The body's coordinate along a world axis (``x``, ``y`` or ``z``) is within ``tolerance`` of ``position``, m."""
+    return Condition(
+        f"{body} at {axis} = {position:g} m",
+        lambda world: bool(abs(world.pose(body).position["xyz".index(axis)] - position) < tolerance),
+    )
+
+
+def raised(body: str, height: float) -> Condition:
+    """The body's foot point is higher than ``height``, m."""
+    return Condition(f"{body} raised by {height:g} m", lambda world: bool(world.pose(body).position[2] > height))
 
 
 def failed(conditions: tuple[Condition, ...], world: World) -> tuple[str, ...]:

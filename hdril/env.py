@@ -50,7 +50,7 @@ class BimanualEnv(gym.Env):
         self.task, self.task_description = self.task_spec.name, self.task_spec.description
         self.render_mode = render_mode
         self._max_episode_steps = max_episode_steps or self.task_spec.horizon
-        self._physics, self._meshes = physics or Physics(), meshes
+        self._physics, self._meshes = physics or self.task_spec.physics, meshes
         self._world: World | None = None
         self.controller = EndEffectorController(self.robot_spec)
         high = np.full(7 * len(self.task_spec.observed), np.inf, np.float32)
@@ -89,6 +89,10 @@ class BimanualEnv(gym.Env):
             spinningFriction=robot.actuation.pad_torsion,
             frictionAnchor=1,
         )
+        for arm in robot.arms.values():
+            # One motor drives both fingers (the URDF's mimic tag, which PyBullet ignores). Fingers driven apart push
+            # against each other with equal forces, and what they hold floats between them.
+            world.couple_joints(ROBOT, *arm.gripper.joints, max_force=robot.actuation.finger_gear_force)
         world.set_joint_velocity_limits(ROBOT, robot.actuation.velocities)
         for body in task.bodies:
             world.add_body(body, task.placements[body.name].sample(self.np_random))
@@ -104,7 +108,8 @@ class BimanualEnv(gym.Env):
         self.controller.start(self._world)
         self.controller.hold(SETTLE_PERIODS * self._physics.substeps)
         self.frame = 0
-        return self._observe(), {"is_success": False}
+        self._stages = 0
+        return self._observe(), {"is_success": False} | self._progress(success=False)
 
     def step(
         self, action: NDArray[np.floating]
@@ -124,8 +129,14 @@ class BimanualEnv(gym.Env):
             "is_success": success,
             "unmet": ", ".join(missing),
             "ik_failure": "; ".join(f"{side}: {why}" for side, why in self.controller.failures.items()),
-        }
+        } | self._progress(success)
         return self._observe(), float(success), success, not success and self.frame >= self._max_episode_steps, info
+
+    def _progress(self, success: bool) -> dict[str, Any]:
+        """``stage``: how many of the task's stages have been reached, success being the last; and its measures."""
+        task = self.task_spec
+        self._stages = task.stages_reached(self.world, self._stages)
+        return {"stage": len(task.stages) + 1 if success else self._stages} | task.read_measures(self.world)
 
     def _observe(self) -> dict[str, NDArray[np.float32]]:
         objects = [

@@ -20,7 +20,7 @@ from hdril.env import BimanualEnv
 from hdril.metrics import trajectory_error
 from hdril.primitives import Noise
 from hdril.recording import Provenance, read_provenance
-from hdril.tasks import Task
+from hdril.tasks import Task, base_name
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,8 @@ class Trace:
     scripted: NDArray[np.int64]  # (T,), label of the expert; -1 past its end
     predicted: NDArray[np.int64]  # (T,), label that the policy plays; -1 if it has none
     ik_failures: tuple[str, ...]  # (T,), empty strings where there was none
+    stage: NDArray[np.int64]  # (T + 1,), how many of the task's stages were reached, success being the last
+    measures: NDArray[np.float64]  # (T + 1, measures of the task)
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,10 @@ class Outcome:
     """x and y of every observed object at the start, m."""
     primitives: tuple[str, ...] = ()
     """What the policy played, in order; empty if it has no primitives."""
+    stage: str = ""
+    """The last of the task's stages that was reached; empty if none was."""
+    measures: dict[str, float] = field(default_factory=dict)
+    """The task's measures at the end."""
 
 
 Act = Callable[[Observation], tuple[NDArray[np.float32], int]]
@@ -108,11 +114,13 @@ class LeRobotActor:
 
 def run_episode(env: BimanualEnv, act: Act, seed: int, labels: NDArray[np.int64]) -> tuple[Trace, bool, str]:
     """Play the scene of ``seed``; ``labels`` are the expert's."""
-    observation, _ = env.reset(seed=seed)
+    observation, info = env.reset(seed=seed)
+    names = [measure.name for measure in env.task_spec.measures]
     joints = env.world.joint_indices(ROBOT, env.controller.joint_names)
     observations, positions = [observation], [env.world.joint_positions(ROBOT, joints)]
     actions, rewards, predicted, failures = [], [], [], []
-    done, info = False, {}
+    progress = [[info[key] for key in ("stage", *names)]]
+    done = False
     while not done:
         action, label = act(observation)
         observation, reward, terminated, truncated, info = env.step(action)
@@ -123,6 +131,7 @@ def run_episode(env: BimanualEnv, act: Act, seed: int, labels: NDArray[np.int64]
         rewards.append(reward)
         predicted.append(label)
         failures.append(info["ik_failure"])
+        progress.append([info[key] for key in ("stage", *names)])
     scripted = np.full(len(actions), -1)
     scripted[: len(labels)] = labels[: len(actions)]
     trace = Trace(
@@ -134,6 +143,8 @@ def run_episode(env: BimanualEnv, act: Act, seed: int, labels: NDArray[np.int64]
         scripted=scripted,
         predicted=np.array(predicted),
         ik_failures=tuple(failures),
+        stage=np.array([row[0] for row in progress]),
+        measures=np.array([row[1:] for row in progress], dtype=np.float64),
     )
     return trace, bool(info["is_success"]), str(info["unmet"])
 
@@ -179,6 +190,8 @@ def judge(task: Task, seed: int, trace: Trace, reference: Trace, success: bool, 
         position_error_cm_by_primitive=by_primitive,
         start=tuple(round(float(v), 4) for v in start.ravel()),
         primitives=played,
+        stage=("", *(stage.name for stage in task.stages), "success")[trace.stage[-1]],
+        measures={m.name: round(float(v), 5) for m, v in zip(task.measures, trace.measures[-1], strict=True)},
     )
 
 
@@ -278,7 +291,7 @@ def check_held_out(provenance: Provenance | None, task: str, seeds: list[int]) -
     """
     if provenance is None:
         return False
-    if provenance.recipe.task != task:
+    if base_name(provenance.recipe.task) != base_name(task):
         raise ValueError(f"the policy was trained on the task {provenance.recipe.task!r}, not on {task!r}")
     if shared := set(seeds) & set(provenance.seeds):
         raise ValueError(

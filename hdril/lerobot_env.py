@@ -37,9 +37,10 @@ class HDRILEnvConfig(EnvConfig):
     )
 
     def __post_init__(self) -> None:
-        if self.task not in TASKS:
+        try:
+            spec = get_task(self.task or "")
+        except ValueError:
             return
-        spec = TASKS[self.task]
         self.features = {
             ACTION: PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),)),
             "agent_pos": PolicyFeature(FeatureType.STATE, (len(ACTION_NAMES),)),

@@ -102,22 +102,42 @@ def plan(primitive: Primitive, scene: Scene, noise: Noise, rng: np.random.Genera
 # ---------------------------------------------------------------------- goals
 
 
-def at_object(body: str, grips: dict[str, Pose], opening: float, back_off: float = 0.0) -> Callable[[Scene], Hands]:
-    """Each hand at ``grips[side]``, given in the frame of ``body``, backed off along its approach (tool z) by metres."""
+@dataclass(frozen=True)
+class Grip:
+    """Where a hand takes hold: a tool pose in the frame of a body."""
+
+    body: str
+    pose: Pose
+
+
+Grips = dict[str, Grip]
+"""A grip for each side."""
+
+
+def at_grips(grips: Grips, opening: float, back_off: float = 0.0, above: float = 0.0) -> Callable[[Scene], Hands]:
+    """Each hand at its grip, backed off along its approach (tool z) and raised (world z) by metres."""
 
     def goal(scene: Scene) -> Hands:
         retreat = Pose((0.0, 0.0, -back_off))
-        return {side: HandCommand(scene.objects[body] @ grips[side] @ retreat, opening) for side in SIDES}
+        return {
+            side: HandCommand((scene.objects[grip.body] @ grip.pose @ retreat).translated((0.0, 0.0, above)), opening)
+            for side, grip in grips.items()
+        }
 
     return goal
 
 
-def carry_to(body: str, target: Callable[[Pose], Pose]) -> Callable[[Scene], Hands]:
-    """Both hands moved as one with the body: hand' = target(body) body^-1 hand, from what they were last told."""
+Targets = Callable[[Scene], dict[str, Pose]]
+"""Where bodies are to go, by name, given where everything is."""
+
+
+def carry_to(held: dict[str, str], targets: Targets) -> Callable[[Scene], Hands]:
+    """Each hand moved with the body it holds (``held[side]``): hand' = target body^-1 hand, from what it was last told."""
 
     def goal(scene: Scene) -> Hands:
-        motion = target(scene.objects[body]) @ scene.objects[body].inverse()
-        return {side: HandCommand(motion @ hand.pose, hand.opening) for side, hand in scene.hands.items()}
+        goals = targets(scene)
+        motions = {body: goals[body] @ scene.objects[body].inverse() for body in goals}
+        return {side: HandCommand(motions[held[side]] @ hand.pose, hand.opening) for side, hand in scene.hands.items()}
 
     return goal
 
@@ -137,22 +157,47 @@ def hands_at(opening: float, back_off: float = 0.0, rise: float = 0.0) -> Callab
 # ---------------------------------------------------------------------- constructors
 
 
-def grasp(body: str, grips: dict[str, Pose], frames: int = 10, clearance: float = 0.08) -> Primitive:
+def grasp(grips: Grips, frames: int = 10, clearance: float = 0.08) -> Primitive:
     """Approach with open hands, reach in along the approach axis, close."""
     close, reach = 2, 3
     return Primitive(
         "grasp",
         (
-            Segment(frames - close - reach, at_object(body, grips, 1.0, back_off=clearance)),
-            Segment(reach, at_object(body, grips, 1.0), jitter=0.25),
-            Segment(close, at_object(body, grips, 0.0), jitter=0.0),
+            Segment(frames - close - reach, at_grips(grips, 1.0, back_off=clearance)),
+            Segment(reach, at_grips(grips, 1.0), jitter=0.25),
+            Segment(close, at_grips(grips, 0.0), jitter=0.0),
+        ),
+    )
+
+
+def reach(name: str, grips: Grips, frames: int = 10, above: float = 0.12) -> Primitive:
+    """Bring open hands to ``above`` metres over their grips."""
+    return Primitive(name, (Segment(frames, at_grips(grips, 1.0, above=above)),))
+
+
+def lower(name: str, grips: Grips, frames: int = 10) -> Primitive:
+    """Come down on the grips with open hands, and close."""
+    close = 3
+    return Primitive(
+        name,
+        (
+            Segment(frames - close, at_grips(grips, 1.0), jitter=0.25),
+            Segment(close, at_grips(grips, 0.0), jitter=0.0),
         ),
     )
 
 
 def carry(name: str, body: str, target: Callable[[Pose], Pose], frames: int = 12, jitter: float = 1.0) -> Primitive:
-    """Take a held body to ``target(body pose)``."""
-    return Primitive(name, (Segment(frames, carry_to(body, target), jitter=jitter, rigid=True),))
+    """Take a body that both hands hold to ``target(body pose)``."""
+    goal = carry_to(dict.fromkeys(SIDES, body), lambda scene: {body: target(scene.objects[body])})
+    return Primitive(name, (Segment(frames, goal, jitter=jitter, rigid=True),))
+
+
+def carry_each(
+    name: str, held: dict[str, str], targets: Targets, frames: int = 12, jitter: float = 1.0, rigid: bool = False
+) -> Primitive:
+    """Take the body in each hand to its own target. ``rigid`` once the bodies are joined."""
+    return Primitive(name, (Segment(frames, carry_to(held, targets), jitter=jitter, rigid=rigid),))
 
 
 def move(body: str, x: float, y: float, frames: int = 12) -> Primitive:
@@ -175,15 +220,30 @@ def place(body: str, height: float, frames: int = 12) -> Primitive:
     return carry("place", body, lambda pose: Pose((pose.position[0], pose.position[1], height)), frames, jitter=0.5)
 
 
-def retract(frames: int = 12, distance: float = 0.10, rise: float = 0.10) -> Primitive:
-    """Open, back out along the approach, rise."""
+def lift_joined(name: str = "lift", rise: float = 0.12, squeeze: float = 0.006, frames: int = 10) -> Primitive:
+    """Raise what both hands hold between them, pressing them together by ``squeeze``, m, each, along the line between
+    the hands: bodies that are joined by nothing but a peg sag in the middle and would come apart."""
+
+    def goal(scene: Scene) -> Hands:
+        left, right = scene.hands["left"].pose, scene.hands["right"].pose
+        inwards = (right.position - left.position) / np.linalg.norm(right.position - left.position)
+        return {
+            side: HandCommand(hand.pose.translated(sign * squeeze * inwards + (0.0, 0.0, rise)), hand.opening)
+            for (side, hand), sign in zip(scene.hands.items(), (1.0, -1.0), strict=True)
+        }
+
+    return Primitive(name, (Segment(frames, goal, rigid=True),))
+
+
+def retract(name: str = "retract", frames: int = 12, distance: float = 0.10, rise: float = 0.10) -> Primitive:
+    """Open, back out along the approach, rise; straight up if ``distance`` is 0."""
     release = 2
-    back = (frames - release) // 2
+    back = (frames - release) // 2 if distance else 0
     return Primitive(
-        "retract",
+        name,
         (
             Segment(release, hands_at(1.0), jitter=0.0),
-            Segment(back, hands_at(1.0, back_off=distance), jitter=0.25),
-            Segment(frames - release - back, hands_at(1.0, back_off=distance, rise=rise)),
+            *((Segment(back, hands_at(1.0, back_off=distance), jitter=0.25),) if back else ()),
+            Segment(frames - release - back, hands_at(1.0, back_off=distance, rise=rise), jitter=1.0 if back else 0.25),
         ),
     )

@@ -33,17 +33,21 @@ MAX_SEED = 2**31 - 1
 class Recipe:
     """All that makes a demonstration, beside its seed: with both, any episode can be made again, bit for bit.
 
+    ``physics`` is the task's own unless given.
+
     Raises:
         ValueError: unknown task or robot.
     """
 
     task: str
     noise: Noise = field(default_factory=Noise)
-    physics: Physics = field(default_factory=Physics)
+    physics: Physics | None = None
     robot: str = "baxter"
 
     def __post_init__(self) -> None:
-        get_task(self.task)
+        task = get_task(self.task)
+        if self.physics is None:
+            object.__setattr__(self, "physics", task.physics)
 
     def as_dict(self) -> dict[str, Any]:
         return asdict(self) | {"hdril_version": __version__}

@@ -61,6 +61,7 @@ def summarise(run: Run, outcomes: list[Outcome]) -> dict[str, Any]:
             )
             for name in labels
         },
+        "stages_reached": dict(Counter(o.stage or "none" for o in outcomes)),
         "pc_expert_order": 100.0 * sum(o.primitives == script for o in planned) / len(planned) if planned else None,
         "hdril_version": __version__,
         "per_episode": [asdict(outcome) for outcome in outcomes],
@@ -130,8 +131,18 @@ def _markdown(run: Run, outcomes: list[Outcome], summary: dict[str, Any]) -> str
             "What did not hold: " + ", ".join(f"{reason} ({n})" for reason, n in reasons.most_common()) + ".",
             "",
         ]
-        lines += ["| seed | not met | position error, cm | frames without inverse kinematics |", "|---|---|---|---|"]
-        lines += [f"| {o.seed} | {o.unmet} | {o.position_error_cm:.2f} | {o.ik_failures} |" for o in failures]
+        if stages := get_task(run.task).stages:
+            reached = Counter(outcome.stage or "none" for outcome in failures)
+            order = ("none", *(stage.name for stage in stages))
+            counts = ", ".join(f"{name} ({reached[name]})" for name in order if reached[name])
+            lines += [f"How far they came: {counts}.", ""]
+        measures = [measure.name for measure in get_task(run.task).measures]
+        heads = ["seed", "not met", "last stage", *measures, "position error, cm", "frames without inverse kinematics"]
+        lines += ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+        for o in failures:
+            values = [f"{o.measures[name]:.4g}" for name in measures]
+            row = [str(o.seed), o.unmet, o.stage or "none", *values, f"{o.position_error_cm:.2f}", str(o.ik_failures)]
+            lines.append("| " + " | ".join(row) + " |")
         lines += [""]
     return "\n".join(lines)
 

@@ -76,6 +76,7 @@ def _log_scene(stream: rr.RecordingStream, env: BimanualEnv) -> None:
             rr.Boxes3D(
                 sizes=[box.size for box in body.boxes],
                 centers=[box.centre for box in body.boxes],
+                quaternions=[box.quaternion for box in body.boxes],
                 colors=[[round(255 * c) for c in box.colour] for box in body.boxes],
                 fill_mode="solid",
             ),
@@ -155,6 +156,9 @@ def _log_scalars(
         send(f"gripper/{side}/commanded", trace.action[:, 8 * i + 7], times[:-1])
         send(f"gripper/{side}/measured", trace.state[:, 8 * i + 7], times)
     send("reward", trace.reward, times[1:])
+    send("progress/stage", trace.stage, times)
+    for measure, values in zip(env.task_spec.measures, trace.measures.T, strict=True):
+        send(f"progress/{measure.name}", values, times)
     for i, failure in enumerate(trace.ik_failures):
         if failure:
             stream.set_time(TIMELINE, duration=float(times[i]))
@@ -195,6 +199,7 @@ def _blueprint(env: BimanualEnv) -> rrb.Blueprint:
                 rrb.TextDocumentView(origin="summary", name="Outcome"),
                 rrb.TimeSeriesView(origin="tracking_error_mm", name="Hand to command, mm"),
                 rrb.TimeSeriesView(origin="gripper", name="Gripper opening"),
+                rrb.TimeSeriesView(origin="progress", name="Stage and measures"),
                 rrb.TextLogView(origin="log", name="Events"),
             ),
             column_shares=[3, 1],

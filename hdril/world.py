@@ -11,7 +11,7 @@ import numpy as np
 import pybullet as bullet
 from numpy.typing import NDArray
 
-from hdril.geometry import Pose
+from hdril.geometry import IDENTITY_QUATERNION, Pose
 
 Vector3 = tuple[float, float, float]
 Colour = tuple[float, float, float, float]
@@ -40,11 +40,12 @@ class Physics:
 
 @dataclass(frozen=True)
 class Box:
-    """A solid box of a compound body: full edge lengths and centre in the body's frame, m."""
+    """A solid box of a compound body: full edge lengths and centre (m), and orientation (xyzw), in the body's frame."""
 
     size: Vector3
     centre: Vector3
     colour: Colour = (0.72, 0.53, 0.36, 1.0)
+    quaternion: tuple[float, float, float, float] = IDENTITY_QUATERNION
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,8 @@ class BodySpec:
         total = np.zeros(3)
         for box, mass in zip(self.boxes, masses, strict=True):
             size, arm = np.square(box.size), np.square(np.array(box.centre) - self.centre_of_mass)
-            total += mass * ((size.sum() - size) / 12.0 + arm.sum() - arm)  # parallel axes
+            turn = np.square(Pose((0.0, 0.0, 0.0), box.quaternion).rotation_matrix())
+            total += mass * (turn @ (size.sum() - size) / 12.0 + arm.sum() - arm)  # parallel axes
         return total
 
 
@@ -164,8 +166,10 @@ class World:
         # Shapes are given about the body's frame; PyBullet wants them about the centre of mass.
         centres = [list(np.array(box.centre) - com) for box in spec.boxes]
         shapes = {"shapeTypes": [bullet.GEOM_BOX] * len(half), "halfExtents": half}
-        collision = self._call("createCollisionShapeArray", collisionFramePositions=centres, **shapes)
-        visual = self._call("createVisualShapeArray", visualFramePositions=centres,
+        turns = [box.quaternion for box in spec.boxes]
+        collision = self._call("createCollisionShapeArray", collisionFramePositions=centres,
+                               collisionFrameOrientations=turns, **shapes)  # fmt: skip
+        visual = self._call("createVisualShapeArray", visualFramePositions=centres, visualFrameOrientations=turns,
                             rgbaColors=[box.colour for box in spec.boxes], **shapes)  # fmt: skip
         at = pose @ Pose(com)
         body = self._call("createMultiBody", spec.mass, collision, visual, at.position, at.quaternion)
@@ -189,6 +193,15 @@ class World:
         """Cap joint speeds, rad/s or m/s."""
         for joint, limit in limits.items():
             self._call("changeDynamics", self._id(body), self._joint(body, joint), maxJointVelocity=limit)
+
+    def couple_joints(self, body: str, first: str, second: str, max_force: float) -> None:
+        """Gear two joints of one body so that they move by opposite amounts, with at most ``max_force`` (N or Nm)."""
+        if self._began:
+            raise RuntimeError(f"joints of {body!r} cannot be coupled: the episode has begun")
+        gear = self._call("createConstraint", self._id(body), self._joint(body, first), self._id(body),
+                          self._joint(body, second), bullet.JOINT_GEAR, (0, 1, 0), (0, 0, 0), (0, 0, 0))  # fmt: skip
+        # PyBullet's ratio has the sign of gears that mesh: 1 turns them against each other.
+        self._call("changeConstraint", gear, gearRatio=1, relativePositionTarget=0, erp=0.5, maxForce=max_force)
 
     def ignore_collisions(self, body: str, pairs: Sequence[tuple[str, str]]) -> None:
         """Let the named pairs of links of one body pass through each other."""

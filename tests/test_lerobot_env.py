@@ -23,7 +23,7 @@ from hdril.tasks import TASKS, get_task
 
 
 class Scripted(PreTrainedPolicy):
-    """The expert as a LeRobot policy, from observations alone. It never closes its hands on what starts to the left."""
+    """The expert as a LeRobot policy, from observations alone. It never closes its hands on what starts far off."""
 
     config_class = HDRILConfig  # pyright: ignore
     name = "scripted"  # pyright: ignore
@@ -31,6 +31,8 @@ class Scripted(PreTrainedPolicy):
     def __init__(self, task: str) -> None:
         super().__init__(HDRILConfig(device="cpu", push_to_hub=False))
         self.task = get_task(task)
+        placement = self.task.placements[self.task.observed[0]]
+        self.middle = 0.5 * (placement.low[0] + placement.high[0])
         self.dummy = torch.nn.Parameter(torch.zeros(1))
         self.experts: list[tuple[Demonstrator, bool]] = []
 
@@ -40,7 +42,7 @@ class Scripted(PreTrainedPolicy):
     def select_action(self, batch, **kwargs) -> torch.Tensor:
         states, objects = batch["observation.state"].numpy(), batch["observation.environment_state"].numpy()
         if not self.experts:
-            self.experts = [(Demonstrator(self.task, Noise(0.0)), row[1] > 0.0) for row in objects]
+            self.experts = [(Demonstrator(self.task, Noise(0.0)), row[0] > self.middle) for row in objects]
         actions = []
         for (expert, spoiled), state, row in zip(self.experts, states, objects, strict=True):
             action = expert.act({"agent_pos": state, "environment_state": row}).action

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from hdril.cli.common import run
 from hdril.recording import Recipe, record
-from hdril.tasks import TASKS
+from hdril.tasks import get_task
 from hdril.world import World
 
 
@@ -105,7 +105,7 @@ def bench_action(root: Path, task: str) -> Figure:
     metadata = LeRobotDatasetMetadata("hdril/bench", root=root)
     policy = make_policy(HDRILConfig(device="cpu", push_to_hub=False), ds_meta=metadata)
     batch = {key: torch.zeros(1, *metadata.features[key]["shape"]) for key in metadata.features if "observation" in key}
-    horizon = TASKS[task].horizon
+    horizon = get_task(task).horizon
 
     def episode() -> None:
         policy.reset()

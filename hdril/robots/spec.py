@@ -50,14 +50,16 @@ class Actuation:
     """Everything about the drives that the simulator is told, in one place.
 
     ``efforts`` replaces the URDF's limits (Nm or N), joint by joint: a departure from the model, to be justified where
-    it is set. ``arm_gain`` and ``finger_gain`` are PyBullet's dimensionless position gains. ``velocities`` are the
-    arm joints' speed limits, rad/s: targets move no faster. ``pad_torsion`` is PyBullet's spinning friction, m: the
-    lever arm of friction about a contact's normal, which point contacts lack.
+    it is set. ``arm_gain`` and ``finger_gain`` are PyBullet's dimensionless position gains. ``finger_gear_force``, N, is
+    what the gear between the two fingers of a hand can take. ``velocities`` are the arm joints' speed limits, rad/s:
+    targets move no faster. ``pad_torsion`` is PyBullet's spinning friction, m: the lever arm of friction about a
+    contact's normal, which point contacts lack.
     """
 
     efforts: dict[str, float]
     arm_gain: float = 0.3
     finger_gain: float = 0.3
+    finger_gear_force: float = 500.0
     pad_friction: float = 1.0
     pad_torsion: float = 0.0
     velocities: dict[str, float] = field(default_factory=dict)

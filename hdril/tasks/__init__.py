@@ -1,35 +1,65 @@
-"""Tasks by name. To add one, add a module here that defines ``TASK``: it is found by itself."""
+"""Tasks by name. To add one, add a module here that defines ``TASK``: it is found by itself.
 
+A module may also define ``make_task``, with a default for every parameter: these can then be set with the name, as in
+``peg_in_hole:clearance=0.003``, wherever a task's name is taken.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
 from importlib import import_module
+from inspect import signature
 from pkgutil import iter_modules
 
 from hdril.tasks.task import Task, Uniform, fixed
 
 
-def _discover() -> dict[str, Task]:
+def _discover() -> tuple[dict[str, Task], dict[str, Callable[..., Task]]]:
     tasks: dict[str, Task] = {}
-    for module in iter_modules(__path__):
-        task = getattr(import_module(f"{__name__}.{module.name}"), "TASK", None)
+    builders: dict[str, Callable[..., Task]] = {}
+    for found in iter_modules(__path__):
+        module = import_module(f"{__name__}.{found.name}")
+        task = getattr(module, "TASK", None)
         if task is None:
             continue
         if task.name in tasks:
             raise ValueError(f"two tasks are named {task.name!r}")
         tasks[task.name] = task
-    return tasks
+        if hasattr(module, "make_task"):
+            builders[task.name] = module.make_task
+    return tasks, builders
 
 
-TASKS: dict[str, Task] = _discover()
+TASKS, _BUILDERS = _discover()
+"""Tasks by name, with the defaults of their parameters."""
+
+
+def base_name(name: str) -> str:
+    """A task's name without parameters."""
+    return name.partition(":")[0]
 
 
 def get_task(name: str) -> Task:
-    """The task of that name.
+    """The task of that name, with its parameters if there are any: ``name`` or ``name:parameter=number,…``.
 
     Raises:
-        ValueError: unknown name; lists the valid ones.
+        ValueError: unknown name or parameter, or a value that is not a number or out of range; lists the valid ones.
     """
-    if name not in TASKS:
-        raise ValueError(f"unknown task {name!r}; choose from: {', '.join(TASKS)}")
-    return TASKS[name]
+    base, _, settings = name.partition(":")
+    if base not in TASKS:
+        raise ValueError(f"unknown task {base!r}; choose from: {', '.join(TASKS)}")
+    if not settings:
+        return TASKS[base]
+    known = signature(_BUILDERS[base]).parameters if base in _BUILDERS else {}
+    values: dict[str, float] = {}
+    for setting in settings.split(","):
+        parameter, _, text = setting.partition("=")
+        if parameter not in known:
+            raise ValueError(f"{base} has no parameter {parameter!r}; it has: {', '.join(known) or 'none'}")
+        try:
+            values[parameter] = float(text)
+        except ValueError:
+            raise ValueError(f"{parameter} must be a number, got {text!r}") from None
+    return replace(_BUILDERS[base](**values), name=name)
 
 
-__all__ = ["TASKS", "Task", "Uniform", "fixed", "get_task"]
+__all__ = ["TASKS", "Task", "Uniform", "base_name", "fixed", "get_task"]

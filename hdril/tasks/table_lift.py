@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from hdril.conditions import ROBOT, at_height, at_rest, not_touching, touching, upright
 from hdril.geometry import Pose
-from hdril.primitives import extend, grasp, lift, move, place, retract
+from hdril.primitives import Grip, extend, grasp, lift, move, place, retract
 from hdril.tasks.scene import BENCH, BENCH_PLACEMENT
 from hdril.tasks.task import Task, Uniform, fixed
 from hdril.world import BodySpec, Box
@@ -41,7 +41,9 @@ PLATFORM = BodySpec("platform", (Box((0.30, 0.90, PLATFORM_HEIGHT), (0.0, 0.0, P
 
 # Hands pitched 45 degrees, down and forward, jaws across the handles.
 _PITCH = Rotation.from_matrix(np.array([[-1, 0, 1], [0, np.sqrt(2), 0], [-1, 0, -1]]) / np.sqrt(2)).as_quat()
-GRIPS = {side: Pose((0.0, y, GRIP_HEIGHT), _PITCH) for side, y in (("left", HANDLE_Y), ("right", -HANDLE_Y))}
+GRIPS = {
+    side: Grip("table", Pose((0.0, y, GRIP_HEIGHT), _PITCH)) for side, y in (("left", HANDLE_Y), ("right", -HANDLE_Y))
+}
 
 TASK = Task(
     name="table_lift",
@@ -55,7 +57,7 @@ TASK = Task(
     },
     observed=("table",),
     primitives=(
-        grasp("table", GRIPS),
+        grasp(GRIPS),
         move("table", x=0.66, y=0.0),
         lift("table", height=PLATFORM_HEIGHT + 0.06),
         extend("table", x=PLATFORM_X, y=0.0),

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hdril.conditions import Condition
+from hdril.conditions import Condition, Measure, Stage, failed
 from hdril.geometry import Pose
 from hdril.primitives import Primitive
-from hdril.world import BodySpec, Camera
+from hdril.world import BodySpec, Camera, Physics, World
 
 DEFAULT_CAMERA = Camera()
+DEFAULT_PHYSICS = Physics()
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,8 @@ class Task:
     """A scene, the primitives that solve it, and what counts as success, as data.
 
     ``bodies`` stand at ``placements[name]`` when an episode starts; those in ``observed`` are in the observation, in
-    this order. Success is judged from frame ``horizon`` on, when the primitives are over.
+    this order. Success is judged from frame ``horizon`` on, when the primitives are over. ``measures`` and ``stages`` are
+    logged at every frame: they say how far a failed episode came. The last stage is success itself and is not listed.
     """
 
     name: str
@@ -43,7 +45,10 @@ class Task:
     observed: tuple[str, ...]
     primitives: tuple[Primitive, ...]
     success: tuple[Condition, ...]
+    measures: tuple[Measure, ...] = ()
+    stages: tuple[Stage, ...] = ()
     camera: Camera = DEFAULT_CAMERA
+    physics: Physics = DEFAULT_PHYSICS
 
     def __post_init__(self) -> None:
         names = [body.name for body in self.bodies]
@@ -62,6 +67,16 @@ class Task:
     def labels(self) -> tuple[str, ...]:
         """Names of the primitives, each once, in the order of their first use: a label is an index into this."""
         return tuple(dict.fromkeys(primitive.name for primitive in self.primitives))
+
+    def read_measures(self, world: World) -> dict[str, float]:
+        """The measures by name."""
+        return {measure.name: measure.read(world) for measure in self.measures}
+
+    def stages_reached(self, world: World, before: int) -> int:
+        """How many stages have been reached, given how many had been a frame ago."""
+        while before < len(self.stages) and not failed(self.stages[before].conditions, world):
+            before += 1
+        return before
 
 
 def fixed(position: Sequence[float]) -> Uniform:
