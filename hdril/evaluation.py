@@ -15,12 +15,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdril.conditions import ROBOT
+from hdril.control import ACTION_NAMES
 from hdril.demonstrator import Demonstrator, Observation
 from hdril.env import BimanualEnv
 from hdril.metrics import trajectory_error
 from hdril.primitives import Noise
 from hdril.recording import Provenance, read_provenance
 from hdril.tasks import Task, base_name
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What a policy with primitives thinks at a frame, in the task's labels."""
+
+    primitive: int
+    """Label of what it plays."""
+    probabilities: NDArray[np.float32]
+    """(K,), the planner's."""
+    plan: NDArray[np.float32] | None
+    """(M, 16), the actions from here to the end of the primitive, if it has just planned anew."""
+    attention: NDArray[np.float32]
+    """(N, N), of the dynamics model that plays: how much node u takes from node v."""
+
+
+@dataclass(frozen=True)
+class Move:
+    """What a policy answers to an observation."""
+
+    action: NDArray[np.float32]  # (16,)
+    belief: Belief | None = None
 
 
 @dataclass(frozen=True)
@@ -33,10 +56,17 @@ class Trace:
     joints: NDArray[np.float64]  # (T + 1, joints of the robot)
     reward: NDArray[np.float32]  # (T,)
     scripted: NDArray[np.int64]  # (T,), label of the expert; -1 past its end
-    predicted: NDArray[np.int64]  # (T,), label that the policy plays; -1 if it has none
+    beliefs: tuple[Belief | None, ...]  # (T,)
     ik_failures: tuple[str, ...]  # (T,), empty strings where there was none
     stage: NDArray[np.int64]  # (T + 1,), how many of the task's stages were reached, success being the last
     measures: NDArray[np.float64]  # (T + 1, measures of the task)
+    nodes: tuple[str, ...] = ()
+    """Names of the nodes of the policy's graph."""
+
+    @property
+    def predicted(self) -> NDArray[np.int64]:
+        """(T,), label of the primitive that the policy plays; -1 if it has none."""
+        return np.array([-1 if belief is None else belief.primitive for belief in self.beliefs])
 
 
 @dataclass(frozen=True)
@@ -60,10 +90,14 @@ class Outcome:
     """The last of the task's stages that was reached; empty if none was."""
     measures: dict[str, float] = field(default_factory=dict)
     """The task's measures at the end."""
+    planner_confusion: list[list[int]] = field(default_factory=list)
+    """Frames of the expert's primitive (row) at which the planner preferred each (column); empty without a planner."""
+    planner_boundary_hits: list[bool] = field(default_factory=list)
+    """For each primitive of the expert, whether the planner preferred it at its first frame."""
 
 
-Act = Callable[[Observation], tuple[NDArray[np.float32], int]]
-"""A policy as the evaluation sees it: observation to action (16,) and the label of the primitive it plays, or -1."""
+Act = Callable[[Observation], Move]
+"""A policy as the evaluation sees it."""
 
 
 class LeRobotActor:
@@ -91,45 +125,64 @@ class LeRobotActor:
         )
         self._torch = torch
         self._description = task.description
-        known = {name: label for label, name in enumerate(task.labels)}
-        self._labels = [known.get(name, -1) for name in getattr(config, "primitives", [])]
+        # Columns of the policy's primitives among the task's labels.
+        primitives = getattr(config, "primitives", None) or []
+        self._labels = np.array([task.labels.index(name) if name in task.labels else -1 for name in primitives])
+        self._count = len(task.labels)
+        self.nodes: tuple[str, ...] = ()
+        if primitives and hasattr(self.policy, "planner"):
+            self.nodes = tuple(self.policy.planner.graph.node_names)  # pyright: ignore
 
     def reset(self, seed: int) -> None:
         """Begin an episode; a policy that samples draws the same numbers for the same seed."""
         self._torch.manual_seed(seed)
         self.policy.reset()
 
-    def act(self, observation: Observation) -> tuple[NDArray[np.float32], int]:
-        """The action (16,) for an observation, and the task's label of the primitive that the policy plays, or -1."""
+    def act(self, observation: Observation) -> Move:
+        """The action for an observation, and what the policy thinks if it has primitives."""
         from lerobot.envs.utils import preprocess_observation
 
         batch: dict[str, Any] = preprocess_observation(dict(observation))
         batch["task"] = [self._description]
         with self._torch.inference_mode():
             action = self._after(self.policy.select_action(self._before(batch)))
-        rollout = getattr(self.policy, "rollout", None)
-        label = self._labels[int(rollout.primitive[0])] if rollout is not None else -1
-        return action[0].numpy().astype(np.float32), label
+            return Move(action[0].numpy().astype(np.float32), self._belief())
+
+    def _belief(self) -> Belief | None:
+        rollout: Any = getattr(self.policy, "rollout", None)
+        if not self.nodes or rollout is None:
+            return None
+        probabilities = np.zeros(self._count, np.float32)
+        known = self._labels >= 0
+        probabilities[self._labels[known]] = rollout.probabilities[0].cpu().numpy()[known]
+        plan = rollout.plan[0, :, : len(ACTION_NAMES)].cpu().numpy().copy() if bool(rollout.replanned[0]) else None
+        if plan is not None:
+            # The plan ends with the longest recorded form of this primitive.
+            plan = plan[: max(1, int(self.policy.longest_length[rollout.primitive[0]] - rollout.plan_start[0]))]  # pyright: ignore
+        attention = self.policy.attention().dynamics[0].cpu().numpy()  # pyright: ignore
+        return Belief(int(self._labels[int(rollout.primitive[0])]), probabilities, plan, attention)
 
 
-def run_episode(env: BimanualEnv, act: Act, seed: int, labels: NDArray[np.int64]) -> tuple[Trace, bool, str]:
-    """Play the scene of ``seed``; ``labels`` are the expert's."""
+def run_episode(
+    env: BimanualEnv, act: Act, seed: int, labels: NDArray[np.int64], nodes: tuple[str, ...] = ()
+) -> tuple[Trace, bool, str]:
+    """Play the scene of ``seed``; ``labels`` are the expert's, ``nodes`` the names of those in the policy's beliefs."""
     observation, info = env.reset(seed=seed)
     names = [measure.name for measure in env.task_spec.measures]
     joints = env.world.joint_indices(ROBOT, env.controller.joint_names)
     observations, positions = [observation], [env.world.joint_positions(ROBOT, joints)]
-    actions, rewards, predicted, failures = [], [], [], []
+    actions, rewards, beliefs, failures = [], [], [], []
     progress = [[info[key] for key in ("stage", *names)]]
     done = False
     while not done:
-        action, label = act(observation)
-        observation, reward, terminated, truncated, info = env.step(action)
+        move = act(observation)
+        observation, reward, terminated, truncated, info = env.step(move.action)
         done = terminated or truncated
         observations.append(observation)
         positions.append(env.world.joint_positions(ROBOT, joints))
-        actions.append(action)
+        actions.append(move.action)
         rewards.append(reward)
-        predicted.append(label)
+        beliefs.append(move.belief)
         failures.append(info["ik_failure"])
         progress.append([info[key] for key in ("stage", *names)])
     scripted = np.full(len(actions), -1)
@@ -141,7 +194,8 @@ def run_episode(env: BimanualEnv, act: Act, seed: int, labels: NDArray[np.int64]
         joints=np.stack(positions),
         reward=np.array(rewards, np.float32),
         scripted=scripted,
-        predicted=np.array(predicted),
+        beliefs=tuple(beliefs),
+        nodes=nodes,
         ik_failures=tuple(failures),
         stage=np.array([row[0] for row in progress]),
         measures=np.array([row[1:] for row in progress], dtype=np.float64),
@@ -157,9 +211,11 @@ def demonstrate_trace(env: BimanualEnv, expert: Demonstrator, seed: int) -> Trac
         [p.frames for p in env.task_spec.primitives],
     )
 
-    def act(observation: Observation) -> tuple[NDArray[np.float32], int]:
+    certain, nobody = np.eye(len(env.task_spec.labels), dtype=np.float32), np.zeros((0, 0), np.float32)
+
+    def act(observation: Observation) -> Move:
         step = expert.act(observation)
-        return step.action.astype(np.float32), step.label
+        return Move(step.action.astype(np.float32), Belief(step.label, certain[step.label], None, nobody))
 
     return run_episode(env, act, seed, labels)[0]
 
@@ -178,6 +234,7 @@ def judge(task: Task, seed: int, trace: Trace, reference: Trace, success: bool, 
     changes = np.flatnonzero(np.diff(trace.predicted, prepend=-2))
     played = tuple(str(names[trace.predicted[i]]) for i in changes if 0 <= trace.predicted[i] < len(names))
     start = trace.environment_state[0].reshape(-1, 7)[:, :2]
+    confusion, hits = _planner_scores(trace, len(names))
     return Outcome(
         seed=seed,
         success=success,
@@ -191,8 +248,22 @@ def judge(task: Task, seed: int, trace: Trace, reference: Trace, success: bool, 
         start=tuple(round(float(v), 4) for v in start.ravel()),
         primitives=played,
         stage=("", *(stage.name for stage in task.stages), "success")[trace.stage[-1]],
+        planner_confusion=confusion,
+        planner_boundary_hits=hits,
         measures={m.name: round(float(v), 5) for m, v in zip(task.measures, trace.measures[-1], strict=True)},
     )
+
+
+def _planner_scores(trace: Trace, count: int) -> tuple[list[list[int]], list[bool]]:
+    """Confusion matrix (K, K) over frames, and hits at the first frames of the expert's primitives."""
+    if any(belief is None for belief in trace.beliefs):
+        return [], []
+    preferred = np.array([belief.probabilities.argmax() for belief in trace.beliefs if belief is not None])
+    confusion = np.zeros((count, count), np.int64)
+    scripted = trace.scripted
+    np.add.at(confusion, (scripted[scripted >= 0], preferred[scripted >= 0]), 1)
+    first = np.flatnonzero(np.diff(scripted, prepend=-1))
+    return confusion.tolist(), [bool(preferred[i] == scripted[i]) for i in first if scripted[i] >= 0]
 
 
 @dataclass(frozen=True)
@@ -226,7 +297,7 @@ class Worker:
         task = self.env.task_spec
         reference = demonstrate_trace(self.env, self._expert, seed)
         self._actor.reset(seed)
-        trace, success, unmet = run_episode(self.env, self._actor.act, seed, reference.scripted)
+        trace, success, unmet = run_episode(self.env, self._actor.act, seed, reference.scripted, self._actor.nodes)
         outcome = judge(task, seed, trace, reference, success, unmet)
         if self._keeps(outcome):
             from hdril.rerun_log import write_recording

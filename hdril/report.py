@@ -63,8 +63,23 @@ def summarise(run: Run, outcomes: list[Outcome]) -> dict[str, Any]:
         },
         "stages_reached": dict(Counter(o.stage or "none" for o in outcomes)),
         "pc_expert_order": 100.0 * sum(o.primitives == script for o in planned) / len(planned) if planned else None,
+        "planner": _planner(outcomes),
         "hdril_version": __version__,
         "per_episode": [asdict(outcome) for outcome in outcomes],
+    }
+
+
+def _planner(outcomes: list[Outcome]) -> dict[str, Any] | None:
+    """Accuracy of the planner, percent, and its confusion matrix over frames; None for a policy without one."""
+    judged = [outcome for outcome in outcomes if outcome.planner_confusion]
+    if not judged:
+        return None
+    confusion = np.sum([outcome.planner_confusion for outcome in judged], axis=0)
+    hits = [hit for outcome in judged for hit in outcome.planner_boundary_hits]
+    return {
+        "pc_correct": 100.0 * float(np.trace(confusion) / confusion.sum()),
+        "pc_correct_at_boundaries": 100.0 * float(np.mean(hits)),
+        "confusion": confusion.tolist(),
     }
 
 
@@ -122,6 +137,22 @@ def _markdown(run: Run, outcomes: list[Outcome], summary: dict[str, Any]) -> str
             f"The planner chose the expert's order of primitives in {summary['pc_expert_order']:.1f} % of episodes.",
             "",
         ]
+    if planner := summary["planner"]:
+        lines += [
+            "## Planner",
+            "",
+            f"It prefers the expert's primitive at {planner['pc_correct']:.2f} % of frames, and at "
+            f"{planner['pc_correct_at_boundaries']:.2f} % of the first frames of a primitive. Frames of the expert's primitive "
+            "(row) at which it prefers each (column):",
+            "",
+        ]
+        labels = list(summary["position_error_cm_by_primitive"])
+        lines += ["| | " + " | ".join(labels) + " |", "|" + "---|" * (len(labels) + 1)]
+        lines += [
+            f"| {name} | " + " | ".join(str(count) if count else "" for count in row) + " |"
+            for name, row in zip(labels, planner["confusion"], strict=True)
+        ]
+        lines += [""]
     failures = [outcome for outcome in outcomes if not outcome.success]
     if failures:
         reasons = Counter(reason for outcome in failures for reason in outcome.unmet.split(", "))

@@ -82,7 +82,7 @@ def read_back(path: Path) -> str:
 def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path: Path) -> None:
     env, trace, outcome = played
     failed = replace(outcome, success=False, unmet="table at rest")
-    wrong = replace(trace, predicted=np.where(trace.predicted == 2, 1, trace.predicted))
+    wrong = replace(trace, beliefs=tuple(replace(b, primitive=1) if b.primitive == 2 else b for b in trace.beliefs))
     path = write_recording(tmp_path, env, failed, wrong, trace)
     assert path.name == "seed_0940000_failure.rrd"
     assert recording_name(outcome) == "seed_0940000_success"
@@ -107,6 +107,21 @@ def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path:
     assert any("lift" in lane.split("entity_path:")[0] for lane in text.split("entity_path: /primitive/scripted")[1:])
 
 
+def test_planner_is_scored_by_frames_and_at_boundaries(played) -> None:
+    """A planner that takes the first frame of lift for move is wrong at one frame of 70 and one boundary of six."""
+    env, trace, _ = played
+    move, lift = (env.task_spec.labels.index(name) for name in ("move", "lift"))
+    first = int(np.flatnonzero(trace.scripted == lift)[0])
+    beliefs = list(trace.beliefs)
+    beliefs[first] = replace(beliefs[first], probabilities=np.eye(6)[move])
+    outcome = judge(env.task_spec, 0, replace(trace, beliefs=tuple(beliefs)), trace, True, "")
+    assert outcome.planner_confusion[lift][move] == 1
+    assert np.trace(outcome.planner_confusion) == 69
+    assert outcome.planner_boundary_hits == [True, True, False, True, True, True]
+    nobody = replace(trace, beliefs=(None,) * len(trace.beliefs))
+    assert judge(env.task_spec, 0, nobody, trace, True, "").planner_confusion == []
+
+
 def test_report_says_what_happened(played, tmp_path: Path) -> None:
     _, _, outcome = played
     outcomes = [replace(outcome, seed=s, success=s != 5, unmet="" if s != 5 else "table upright") for s in range(10)]
@@ -116,6 +131,8 @@ def test_report_says_what_happened(played, tmp_path: Path) -> None:
     assert (data["n_success"], data["n_episodes"], data["pc_success"]) == (9, 10, 90.0)
     assert data["pc_success_ci95"] == pytest.approx([100 * v for v in wilson_interval(9, 10)])
     assert data["pc_expert_order"] == 100.0
+    assert data["planner"]["pc_correct"] == data["planner"]["pc_correct_at_boundaries"] == 100.0
+    assert np.array(data["planner"]["confusion"]).sum() == 700
     assert "9 of 10 succeeded: 90.0 %" in headline(data)
     text = (tmp_path / "report.md").read_text()
     assert "table upright (1)" in text

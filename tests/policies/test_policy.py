@@ -15,6 +15,7 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.factory import make_policy
 from lerobot_policy_hdril import HDRILConfig, HDRILPolicy
 from lerobot_policy_hdril.demonstrations import Demonstrations
+from lerobot_policy_hdril.presets import PRESETS
 
 SMALL = {
     "device": "cpu",
@@ -24,15 +25,11 @@ SMALL = {
     "planner_hidden_dim": 16,
     "optimizer_lr": 1e-2,
 }
-VARIANTS = {
-    "HDR-IL": {},
-    "GRU-GRU": {"interaction": "none", "skip": False, "per_primitive": False, "state_skip": False},
-    "Res": {"interaction": "none", "per_primitive": False, "state_skip": False},
-    "Int": {"interaction": "scalar", "skip": False, "per_primitive": False, "state_skip": False},
-    "Res Multi": {"interaction": "none", "state_skip": False},
-    "paper's HDR-IL": {"interaction": "scalar", "state_skip": False},
-    "ODE": {"decoder": "ode"},
+VARIANTS = {name: {"preset": name} for name in PRESETS} | {
     "replanning": {"replan_every": 4},
+    "ODE": {"decoder": "ode"},
+    "variational": {"latent": "variational", "kl_weight": 1e-3},
+    "relational": {"coordinates": "relational"},
 }
 
 
@@ -63,7 +60,8 @@ def test_variant_learns_saves_loads_and_runs(variant: str, metadata, tmp_path: P
         optimizer.step()
         optimizer.zero_grad()
     assert loss.item() < 0.5 * first.item()
-    assert set(info) == {"dynamics_loss", "planner_loss", "planner_accuracy"}
+    assert set(info) == {"dynamics_loss", "latent_divergence", "planner_loss", "planner_accuracy"}
+    assert (info["latent_divergence"] > 0) == (policy.config.latent == "variational")
     policy.save_pretrained(tmp_path / "checkpoint")
     loaded = HDRILPolicy.from_pretrained(tmp_path / "checkpoint")
     frames = [0, 70, 140]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args
 
 from lerobot.configs.policies import PreTrainedConfig
@@ -12,10 +12,13 @@ from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_policy_hdril.graph import feature_names
+from lerobot_policy_hdril.presets import PRESETS
 
 Interaction = Literal["none", "scalar", "object"]
 Decoder = Literal["gru", "ode"]
 Rollout = Literal["closed_loop", "open_loop"]
+Coordinates = Literal["absolute", "relational"]
+Latent = Literal["deterministic", "variational"]
 
 
 def _check_choice(name: str, value: str, choices: Any) -> None:
@@ -29,10 +32,13 @@ class HDRILConfig(PreTrainedConfig):
     """HDR-IL: a planner over primitives, and a graph-recurrent dynamics model for each (paper, Sections 4.1 to 4.3).
 
     The paper's models are values: GRU-GRU is ``interaction=none skip=false per_primitive=false``; Res adds ``skip``;
-    Int adds ``interaction=scalar``; the Multi models and HDR-IL add ``per_primitive``.
+    Int adds ``interaction=scalar``; the Multi models and HDR-IL add ``per_primitive``. ``preset`` names them.
     """
 
     # Variant.
+    preset: str = ""
+    """Name of a model in :data:`~lerobot_policy_hdril.presets.PRESETS`, which then decides the values of this group, and
+    ``hidden_dim`` if that is left at its default; empty to set them one by one."""
     interaction: Interaction = "object"
     """Graph attention: ``none``; ``scalar``, the paper's node per number of the state; ``object``, a node per object."""
     skip: bool = True
@@ -42,6 +48,14 @@ class HDRILConfig(PreTrainedConfig):
     per_primitive: bool = True
     """One dynamics model per primitive (the paper's Multi), or one for all that is told the primitive."""
     decoder: Decoder = "gru"
+    coordinates: Coordinates = "absolute"
+    """``relational``: hands and predictions in the frame of the first object, as it stands when a plan is made."""
+    latent: Latent = "deterministic"
+    """``variational``: a Gaussian, sampled in training (paper, Figure 2)."""
+    kl_weight: float = 0.0
+    """Weight of the Kullback-Leibler divergence of the latent from a unit Gaussian; 0 is the authors' loss."""
+    samples: int = 0
+    """Latents that a prediction averages over; 0: the mean latent."""
 
     # Rollout.
     rollout: Rollout = "closed_loop"
@@ -92,14 +106,38 @@ class HDRILConfig(PreTrainedConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.preset:
+            self._apply_preset()
         _check_choice("interaction", self.interaction, Interaction)
         _check_choice("decoder", self.decoder, Decoder)
         _check_choice("rollout", self.rollout, Rollout)
+        _check_choice("coordinates", self.coordinates, Coordinates)
+        _check_choice("latent", self.latent, Latent)
         for name in ("hidden_dim", "node_dim", "planner_hidden_dim", "planner_batch_size"):
             if getattr(self, name) < 1:
                 raise ValueError(f"policy.{name} must be at least 1, got {getattr(self, name)}")
+        if self.kl_weight < 0 or self.samples < 0:
+            raise ValueError(
+                f"policy.kl_weight and policy.samples must not be negative, got {self.kl_weight} and {self.samples}"
+            )
+        if self.latent == "deterministic" and (self.kl_weight or self.samples):
+            raise ValueError("policy.kl_weight and policy.samples are for policy.latent=variational")
         if self.replan_every < 0:
             raise ValueError(f"policy.replan_every must be 0 (never) or more frames, got {self.replan_every}")
+
+    def _apply_preset(self) -> None:
+        if self.preset not in PRESETS:
+            raise ValueError(f"unknown policy.preset {self.preset!r}; choose from: {', '.join(PRESETS)}")
+        defaults = {entry.name: entry.default for entry in fields(self)}
+        for name, value in PRESETS[self.preset].items():
+            given = getattr(self, name)
+            if name == "hidden_dim" and given != defaults[name]:
+                continue
+            if given not in (value, defaults[name]):
+                raise ValueError(
+                    f"policy.preset={self.preset} makes policy.{name} {value!r}, but {given!r} was given; leave out one"
+                )
+            setattr(self, name, value)
 
     def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
         """Learn what each number of state and action is called. LeRobot calls this when it trains.

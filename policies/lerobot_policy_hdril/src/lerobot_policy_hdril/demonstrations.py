@@ -134,6 +134,11 @@ class Demonstrations:
         runs = [lengths[labels == k] for k in range(len(self.primitives))]
         return [[int(run.min()), int(run.max())] for run in runs]
 
+    @property
+    def segment_starts(self) -> Tensor:
+        """Rows (segments,) at which a primitive begins."""
+        return self._segment_bounds[:, 0]
+
     def rows(self, index: Tensor) -> Tensor:
         """Rows of the frames with these values of ``index`` (B,)."""
         rows = torch.searchsorted(self.index, index)

@@ -34,12 +34,13 @@ class StateSkip(nn.Module):
 
 
 class PrimitiveDynamics(nn.Module):
-    """Graph GRU encoder with the objects' skip connection, latent, decoder.
+    """Graph GRU encoder with the objects' skip connection, latent, decoder (paper, Figure 2).
 
-        h = GRU(graph(s_t), 0)    z = FC([h || s_t^objects || c])    y_i = FC([decoder_i(z) || z]) + L_i s_t
+        h = GRU(graph(s_t), 0)    [m, v] = FC([h || s_t^objects || c])    z = m + exp(v / 2) * noise
+        y_i = FC([decoder_i(z) || z]) + L_i s_t
 
     ``context`` c is empty for a model of one primitive, and says which primitive it is for a model of all. L is there
-    with ``state_skip``.
+    with ``state_skip``. Without ``variational`` there is no v, and z = m.
     """
 
     def __init__(
@@ -54,6 +55,7 @@ class PrimitiveDynamics(nn.Module):
         hidden_dim: int,
         node_dim: int,
         state_skip: bool,
+        variational: bool,
     ) -> None:
         super().__init__()
         self.graph = make_interaction(interaction, names, node_dim)
@@ -62,19 +64,48 @@ class PrimitiveDynamics(nn.Module):
         self.latent = nn.Sequential(
             nn.Linear(hidden_dim + len(skip_columns) + context_dim, hidden_dim),
             nn.SiLU(),
-            nn.Linear(hidden_dim, hidden_dim),
+            nn.Linear(hidden_dim, 2 * hidden_dim if variational else hidden_dim),
         )
+        self.variational = variational
         self.decoder = DECODERS[decoder](hidden_dim, steps)
         self.head = nn.Sequential(nn.Linear(2 * hidden_dim, hidden_dim), nn.SiLU(), nn.Linear(hidden_dim, out_dim))
-
         self.state_skip = StateSkip(len(names), out_dim, steps) if state_skip else None
 
     skip_columns: Tensor
 
-    def forward(self, normalised: Tensor, raw: Tensor, context: Tensor, steps: Tensor) -> Tensor:
-        """States (B, S), context (B, C) and step numbers (B, M) to normalised actions and states (B, M, A + S)."""
+    def forward(
+        self, normalised: Tensor, raw: Tensor, context: Tensor, steps: Tensor, samples: int = 0
+    ) -> tuple[Tensor, Tensor]:
+        """States (B, S), context (B, C) and step numbers (B, M) to a prediction, and how far the latent is from its prior.
+
+        Args:
+            samples: latents to draw and average over; 0 takes the mean latent. In training, one is drawn.
+
+        Returns:
+            Normalised actions and states (B, M, A + S), and KL(N(m, e^v) || N(0, 1)) (B,) in nats, 0 if deterministic.
+        """
         hidden = self.encoder(self.graph(normalised, raw))
         latent = self.latent(torch.cat([hidden, normalised[:, self.skip_columns], context], dim=-1))
-        decoded = self.decoder(latent, steps)
+        divergence = latent.new_zeros(len(latent))
+        if self.variational:
+            mean, log_variance = latent.chunk(2, dim=-1)
+            divergence = 0.5 * (mean.square() + log_variance.exp() - 1.0 - log_variance).sum(-1)
+            noise = self._noise(mean, samples)
+            latent = (mean + (0.5 * log_variance).exp() * noise).flatten(0, 1)
+        copies = len(latent) // max(len(normalised), 1)
+        decoded = self.decoder(latent, steps.repeat(copies, 1))
         output = self.head(torch.cat([decoded, latent[:, None].expand_as(decoded)], dim=-1))
-        return output if self.state_skip is None else output + self.state_skip(normalised, steps)
+        output = output.unflatten(0, (copies, len(normalised))).mean(0)
+        if self.state_skip is not None:
+            output = output + self.state_skip(normalised, steps)
+        return output, divergence
+
+    def _noise(self, mean: Tensor, samples: int) -> Tensor:
+        """(draws, B or 1, H). Outside of training the draws are the same for every row and call: an episode does not depend
+        on those it is batched with, and can be played again."""
+        if self.training:
+            return torch.randn_like(mean)[None]
+        if not samples:
+            return mean.new_zeros(1, 1, 1)
+        generator = torch.Generator().manual_seed(0)
+        return torch.randn(samples, 1, mean.shape[-1], generator=generator).to(mean)

@@ -39,13 +39,22 @@ def group_nodes(names: list[str]) -> dict[str, list[int]]:
 
 def quaternion_groups(names: list[str]) -> list[list[int]]:
     """Indices (qx, qy, qz, qw) of every quaternion among the names."""
-    position = {name: index for index, name in enumerate(names)}
-    prefixes = dict.fromkeys(name.rsplit(".", 1)[0] for name in names if "." in name)
-    groups = [[position.get(f"{prefix}.{axis}") for axis in QUATERNION_AXES] for prefix in prefixes]
-    return [[i for i in group if i is not None] for group in groups if None not in group]
+    return _groups(names, QUATERNION_AXES)
 
 
 def pose_columns(names: list[str], indices: list[int]) -> list[int] | None:
     """Where in a node's numbers its pose (x, y, z, qx, qy, qz, qw) is; None if it has none."""
     axes = {names[index].rsplit(".", 1)[-1]: column for column, index in reversed(list(enumerate(indices)))}
     return [axes[axis] for axis in POSE_AXES] if all(axis in axes for axis in POSE_AXES) else None
+
+
+def pose_groups(names: list[str]) -> list[list[int]]:
+    """Indices (x, y, z, qx, qy, qz, qw) of every pose among the names."""
+    return _groups(names, POSE_AXES)
+
+
+def _groups(names: list[str], axes: tuple[str, ...]) -> list[list[int]]:
+    position = {name: index for index, name in enumerate(names)}
+    prefixes = dict.fromkeys(name.rsplit(".", 1)[0] for name in names if "." in name)
+    groups = [[position.get(f"{prefix}.{axis}") for axis in axes] for prefix in prefixes]
+    return [[i for i in group if i is not None] for group in groups if None not in group]

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lerobot_policy_hdril.coordinates import conjugate, multiply, rotate
 from lerobot_policy_hdril.graph import group_nodes, pose_columns
 
 SLOPE = 0.2  # of LeakyReLU, as in the graph attention paper
@@ -115,20 +116,11 @@ class ObjectAttention(nn.Module):
         """r_uv (B, N, N, 7): position in decimetres, to weigh as much as a rotation, and quaternion; 0 without poses."""
         poses = raw[:, self.poses]
         position, quaternion = poses[..., :3], F.normalize(poses[..., 3:], dim=-1)
-        vector, scalar = -quaternion[:, :, None, :3], quaternion[:, :, None, 3:]  # of the inverse of u's rotation
         offset = 10.0 * (position[:, None] - position[:, :, None])
-        twice = 2.0 * torch.cross(vector.expand_as(offset), offset, dim=-1)
-        offset = offset + scalar * twice + torch.cross(vector.expand_as(offset), twice, dim=-1)
-        other_vector, other_scalar = quaternion[:, None, :, :3], quaternion[:, None, :, 3:]
-        shape = offset.shape
-        turned = (
-            scalar * other_vector
-            + other_scalar * vector
-            + torch.cross(vector.expand(shape), other_vector.expand(shape), dim=-1)
-        )
-        w = scalar * other_scalar - (vector * other_vector).sum(-1, keepdim=True)
-        rotation = torch.cat([turned, w], dim=-1)
-        rotation = torch.where(w < 0, -rotation, rotation)
+        inverse = conjugate(quaternion)[:, :, None].expand(*offset.shape[:-1], 4)
+        offset = rotate(inverse, offset)
+        rotation = multiply(inverse, quaternion[:, None].expand_as(inverse))
+        rotation = torch.where(rotation[..., 3:] < 0, -rotation, rotation)
         return torch.cat([offset, rotation], dim=-1) * self.edges[..., None]
 
     def _weights(self, nodes: Tensor, relations: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lerobot_policy_hdril.configuration_hdril import HDRILConfig
+from lerobot_policy_hdril.coordinates import RelationalCoordinates
 from lerobot_policy_hdril.demonstrations import Demonstrations, History, Window
 from lerobot_policy_hdril.dynamics import PrimitiveDynamics
 from lerobot_policy_hdril.graph import quaternion_groups
@@ -19,6 +20,16 @@ from lerobot_policy_hdril.planner import Planner
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+
+@dataclass(frozen=True)
+class Attention:
+    """Who attends to whom, for B episodes: row u of a matrix says how much node u takes from each node, and sums to 1."""
+
+    nodes: list[str]
+    primitives: list[str]  # (B,), what each episode plays
+    planner: Tensor  # (B, N, N)
+    dynamics: Tensor  # (B, N, N), of the model of the primitive that plays
 
 
 @dataclass
@@ -31,10 +42,12 @@ class Rollout:
     plan_start: Tensor
     replanned: Tensor  # (B,), whether the last step made a new plan
     probabilities: Tensor  # (B, K), of the last step
+    seen: Tensor  # (B, S), the state of the last step: observed, or predicted in an open loop
     memory: Tensor | None = None
 
     @staticmethod
-    def begin(batch: int, steps: int, width: int, primitives: int, device: torch.device) -> Rollout:
+    def begin(state: Tensor, steps: int, width: int, primitives: int) -> Rollout:
+        batch, device = len(state), state.device
         whole = torch.zeros(batch, dtype=torch.long, device=device)
         return Rollout(
             primitive=whole - 1,
@@ -43,6 +56,7 @@ class Rollout:
             plan_start=whole.clone(),
             replanned=whole.bool(),
             probabilities=torch.zeros(batch, primitives, device=device),
+            seen=state,
         )
 
 
@@ -88,6 +102,8 @@ class HDRILPolicy(PreTrainedPolicy):
         self._build()
         if dataset_stats is not None:
             self._set_normalisation(dataset_stats)
+        if self._demonstrations is not None and self.relational is not None:
+            self._set_relational_normalisation(self._demonstrations)
         self.reset()
 
     def _build(self) -> None:
@@ -108,12 +124,16 @@ class HDRILPolicy(PreTrainedPolicy):
                 hidden_dim=config.hidden_dim,
                 node_dim=config.node_dim,
                 state_skip=config.state_skip,
+                variational=config.latent == "variational",
             )
             for _ in range(models)
         )
         self.planner = Planner(
             names, len(config.primitives), config.interaction, config.planner_hidden_dim, config.node_dim
         )
+        self.relational = None
+        if config.coordinates == "relational":
+            self.relational = RelationalCoordinates(names, config.environment_names, [*config.action_names, *names])
         for key, size in (("state", state_dim), ("output", action_dim + state_dim)):
             self.register_buffer(f"{key}_mean", torch.zeros(size))
             self.register_buffer(f"{key}_std", torch.ones(size))
@@ -144,6 +164,17 @@ class HDRILPolicy(PreTrainedPolicy):
             getattr(self, f"{name}_mean").copy_(gather(keys, "mean"))
             getattr(self, f"{name}_std").copy_(gather(keys, "std").clamp_min(self.config.min_std))
 
+    @torch.no_grad()
+    def _set_relational_normalisation(self, demonstrations: Demonstrations) -> None:
+        """LeRobot's statistics are of absolute poses; these are of what the model sees, over the same data."""
+        assert self.relational is not None
+        window = demonstrations.window(demonstrations.segment_starts, 0, self.longest)
+        seen = self.relational.encode_state(demonstrations.state)
+        told = self.relational.encode_output(window.target, window.state)[window.mask]
+        for name, values in (("state", seen), ("output", told)):
+            getattr(self, f"{name}_mean").copy_(values.mean(0))
+            getattr(self, f"{name}_std").copy_(values.std(0).clamp_min(self.config.min_std))
+
     def get_optim_params(self) -> list[dict[str, Any]]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Two groups: the network, and the linear maps at a rate of their own."""
         skips = [p for name, p in self.named_parameters() if ".state_skip." in name]
@@ -165,11 +196,15 @@ class HDRILPolicy(PreTrainedPolicy):
         if self._demonstrations is None:
             raise RuntimeError("this policy was loaded without a dataset: train it with lerobot-train")
         rows = self._demonstrations.rows(batch["index"].flatten())
-        dynamics_loss = self._dynamics_loss(self._demonstrations.window(rows, self.config.replan_every, self.longest))
+        dynamics_loss, divergence = self._dynamics_loss(
+            self._demonstrations.window(rows, self.config.replan_every, self.longest)
+        )
         planner_loss, accuracy = self._planner_loss(
             self._demonstrations.history(rows[: self.config.planner_batch_size])
         )
         loss = dynamics_loss + planner_loss
+        if self.config.kl_weight:
+            loss = loss + self.config.kl_weight * divergence
         if not torch.isfinite(loss):
             raise FloatingPointError(
                 f"the loss is not finite (dynamics {dynamics_loss.item()}, planner {planner_loss.item()}); "
@@ -177,15 +212,20 @@ class HDRILPolicy(PreTrainedPolicy):
             )
         return loss, {
             "dynamics_loss": dynamics_loss.item(),
+            "latent_divergence": divergence.item(),
             "planner_loss": planner_loss.item(),
             "planner_accuracy": accuracy,
         }
 
-    def _dynamics_loss(self, window: Window) -> Tensor:
-        predicted = self._predict(window.state, window.primitive, window.elapsed)
-        target = (window.target - self.output_mean) / self.output_std
+    def _dynamics_loss(self, window: Window) -> tuple[Tensor, Tensor]:
+        """Mean squared error and mean divergence of the latent, nats."""
+        predicted, divergence = self._predict(window.state, window.primitive, window.elapsed)
+        target = window.target
+        if self.relational is not None:
+            target = self.relational.encode_output(target, window.state)
+        target = (target - self.output_mean) / self.output_std
         error = (predicted - target).square() @ self.loss_weights  # (B, M)
-        return (error * window.mask).sum() / window.mask.sum()
+        return (error * window.mask).sum() / window.mask.sum(), divergence.mean()
 
     def _planner_loss(self, history: History) -> tuple[Tensor, float]:
         logits, _ = self.planner(self._normalise(history.state), history.state)
@@ -194,21 +234,26 @@ class HDRILPolicy(PreTrainedPolicy):
         return loss, hits.float().mean().item()
 
     def _normalise(self, state: Tensor) -> Tensor:
+        if self.relational is not None:
+            state = self.relational.encode_state(state)
         return (state - self.state_mean) / self.state_std
 
-    def _predict(self, state: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
-        """Normalised actions and states (B, M, A + S) from raw states (B, S), ``elapsed`` (B,) frames into primitives."""
-        normalised = self._normalise(state)
+    def _predict(self, state: Tensor, primitive: Tensor, elapsed: Tensor) -> tuple[Tensor, Tensor]:
+        """Normalised actions and states (B, M, A + S), and divergence of the latent (B,), nats, from raw states (B, S),
+        ``elapsed`` (B,) frames into primitives."""
+        normalised, samples = self._normalise(state), self.config.samples
         steps = (elapsed[:, None] + torch.arange(self.longest, device=state.device)).clamp_max(self.longest - 1)
         if not self.config.per_primitive:
             context = F.one_hot(primitive, len(self.config.primitives)).to(state.dtype)
-            return self.dynamics[0](normalised, state, context, steps)
+            return self.dynamics[0](normalised, state, context, steps, samples)
         result = torch.empty(len(state), self.longest, len(self.loss_weights), device=state.device, dtype=state.dtype)
+        divergence = state.new_zeros(len(state))
         for k in primitive.unique().tolist():
             mine = (primitive == k).nonzero().squeeze(-1)
             context = state.new_zeros(len(mine), 0)
-            result = result.index_copy(0, mine, self.dynamics[k](normalised[mine], state[mine], context, steps[mine]))
-        return result
+            part, far = self.dynamics[k](normalised[mine], state[mine], context, steps[mine], samples)
+            result, divergence = result.index_copy(0, mine, part), divergence.index_copy(0, mine, far)
+        return result, divergence
 
     # ------------------------------------------------------------------ rollout
 
@@ -220,6 +265,28 @@ class HDRILPolicy(PreTrainedPolicy):
     def rollout(self) -> Rollout | None:
         """Where the running episodes are: for viewers. None before the first action."""
         return self._rollout
+
+    @torch.no_grad()
+    def attention(self) -> Attention:
+        """The attention weights at the last step, for the state that was seen there.
+
+        Raises:
+            RuntimeError: no episode is running.
+        """
+        if self._rollout is None:
+            raise RuntimeError("no episode is running: attention is read after an action")
+        seen, playing = self._rollout.seen, self._rollout.primitive.tolist()
+        normalised = self._normalise(seen)
+        rows = [
+            self.dynamics[k if self.config.per_primitive else 0].graph.attention(normalised[i : i + 1], seen[i : i + 1])
+            for i, k in enumerate(playing)
+        ]
+        return Attention(
+            nodes=list(self.planner.graph.node_names),
+            primitives=[self.config.primitives[k] for k in playing],
+            planner=self.planner.graph.attention(normalised, seen),
+            dynamics=torch.cat(rows),
+        )
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -258,14 +325,13 @@ class HDRILPolicy(PreTrainedPolicy):
         """Update the planner, end and begin primitives, and make the plans that are due."""
         config, rollout = self.config, self._rollout
         if rollout is None or len(rollout.primitive) != len(state):
-            rollout = Rollout.begin(
-                len(state), self.longest, len(self.loss_weights), len(config.primitives), state.device
-            )
+            rollout = Rollout.begin(state, self.longest, len(self.loss_weights), len(config.primitives))
             self._rollout = rollout
         elif config.rollout == "open_loop":
             # The state that the plan predicted for this frame, whatever is seen.
             done = (rollout.elapsed - rollout.plan_start - 1)[:, None, None].expand(-1, 1, rollout.plan.shape[-1])
             state = rollout.plan.gather(1, done).squeeze(1)[:, len(config.action_names) :]
+        rollout.seen = state
         logits, rollout.memory = self.planner(self._normalise(state)[:, None], state[:, None], rollout.memory)
         rollout.probabilities = logits[:, 0].softmax(-1)
         best = rollout.probabilities.argmax(-1)
@@ -279,8 +345,10 @@ class HDRILPolicy(PreTrainedPolicy):
             rollout.replanned = over | (rollout.elapsed % config.replan_every == 0)
         if rollout.replanned.any():
             due = rollout.replanned.nonzero().squeeze(-1)
-            predicted = self._predict(state[due], rollout.primitive[due], rollout.elapsed[due])
+            predicted, _ = self._predict(state[due], rollout.primitive[due], rollout.elapsed[due])
             plan = predicted * self.output_std + self.output_mean
+            if self.relational is not None:
+                plan = self.relational.decode_output(plan, state[due])
             rollout.plan[due] = self._unit_quaternions(plan)
             rollout.plan_start = torch.where(rollout.replanned, rollout.elapsed, rollout.plan_start)
         return rollout

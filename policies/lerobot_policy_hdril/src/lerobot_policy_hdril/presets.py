@@ -1,0 +1,46 @@
+"""The models of the paper (Section 5.1, Tables 1 and 2) and ours, by name, as values of the config."""
+
+from __future__ import annotations
+
+from typing import Any
+
+# One latent per sample, five averaged at test time, and no KL term: what the authors' released code does.
+_AUTHORS = {"state_skip": False, "latent": "variational", "kl_weight": 0.0, "samples": 5}
+_FEATURES: dict[str, dict[str, Any]] = {
+    "gru_gru": {"interaction": "none", "skip": False},
+    "res": {"interaction": "none", "skip": True},
+    "int": {"interaction": "scalar", "skip": False},
+    "resint": {"interaction": "scalar", "skip": True},
+}
+# A model for all primitives is wider, to have about as many parameters as six small ones together (paper, appendix A.1).
+_SINGLE_HIDDEN, _MULTI_HIDDEN = {"none": 322, "scalar": 410}, 128
+
+
+def _presets() -> dict[str, dict[str, Any]]:
+    absolute: dict[str, dict[str, Any]] = {}
+    for name, features in _FEATURES.items():
+        single = {"per_primitive": False, "hidden_dim": _SINGLE_HIDDEN[features["interaction"]]}
+        absolute[name] = _AUTHORS | features | single
+    for name, features in _FEATURES.items():
+        multi = "hdril_paper" if name == "resint" else f"{name}_multi"
+        absolute[multi] = _AUTHORS | features | {"per_primitive": True, "hidden_dim": _MULTI_HIDDEN}
+    every = {name: values | {"coordinates": "absolute", "decoder": "gru"} for name, values in absolute.items()}
+    every |= {f"{name}_relational": values | {"coordinates": "relational"} for name, values in every.items()}
+    every["hdril_paper_ode"] = every["hdril_paper"] | {"decoder": "ode"}
+    every["hdril"] = {
+        "interaction": "object",
+        "skip": True,
+        "state_skip": True,
+        "per_primitive": True,
+        "coordinates": "absolute",
+        "decoder": "gru",
+        "latent": "deterministic",
+        "kl_weight": 0.0,
+        "samples": 0,
+        "hidden_dim": _MULTI_HIDDEN,
+    }
+    return every
+
+
+PRESETS: dict[str, dict[str, Any]] = _presets()
+"""Fields of :class:`~lerobot_policy_hdril.HDRILConfig` by preset."""
