@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
+from lerobot_policy_hdril.coordinates import RelationalCoordinates
 from lerobot_policy_hdril.graph import feature_names, group_nodes, pose_columns, quaternion_groups
-from lerobot_policy_hdril.interaction import INTERACTIONS, make_interaction
+from lerobot_policy_hdril.interaction import INTERACTIONS, SLOPE, ObjectAttention, ScalarAttention, make_interaction
 from scipy.spatial.transform import Rotation
+from torch.nn import functional as F
+from torch_geometric.nn import GATConv, MessagePassing
+from torch_geometric.utils import softmax
 
 from hdril.control import ACTION_NAMES
 from hdril.geometry import Pose
@@ -90,3 +94,72 @@ def test_relations_do_not_depend_on_where_the_scene_is() -> None:
     for node in group_nodes(NAMES).values():
         moved[:, node[:3]] += torch.tensor([0.3, -0.2, 0.1])
     torch.testing.assert_close(graph._relations(moved), graph._relations(state), atol=1e-4, rtol=1e-4)
+
+
+def complete(count: int) -> torch.Tensor:
+    """Edges (2, count^2), source and target, of the complete graph with loops, sorted by target."""
+    target, source = torch.meshgrid(torch.arange(count), torch.arange(count), indexing="ij")
+    return torch.stack([source.flatten(), target.flatten()])
+
+
+def test_scalar_attention_is_torch_geometrics_gatconv() -> None:
+    """The paper's layer: one head, no bias, loops given as edges."""
+    torch.manual_seed(0)
+    ours, state, dim = ScalarAttention(NAMES, 16), states(6), 16
+    theirs = GATConv(1, dim, heads=1, bias=False, add_self_loops=False, negative_slope=SLOPE)
+    edges = complete(len(NAMES))
+    with torch.no_grad():
+        theirs.lin.weight.copy_(ours.project.weight)
+        theirs.att_dst.copy_(ours.score.weight[0].view(1, 1, dim))
+        theirs.att_src.copy_(ours.score.weight[1].view(1, 1, dim))
+        mine, weights = ours(state, state), ours.attention(state, state)
+        for row, one, attention in zip(state, mine, weights, strict=True):
+            out, (_, alpha) = theirs(row[:, None], edges, return_attention_weights=True)
+            torch.testing.assert_close(F.elu(out).flatten(), one, atol=1e-5, rtol=1e-5)
+            torch.testing.assert_close(alpha.view(len(NAMES), len(NAMES)), attention, atol=1e-5, rtol=1e-5)
+
+
+class SparseObjectAttention(MessagePassing):
+    """ObjectAttention's equations, edge by edge, with torch_geometric's message passing and segment softmax."""
+
+    def __init__(self, dense: ObjectAttention) -> None:
+        super().__init__(aggr="add")
+        self.dense = dense
+
+    def forward(self, nodes: torch.Tensor, edges: torch.Tensor, relations: torch.Tensor) -> torch.Tensor:
+        return nodes + F.silu(self.propagate(edges, h=nodes, r=relations))
+
+    def message(self, h_i, h_j, r, index, ptr, size_i):
+        to, source = self.dense.score.weight
+        score = F.leaky_relu(h_i @ to + h_j @ source + r @ self.dense.edge_score.weight[0], SLOPE)
+        alpha = softmax(score, index, ptr, size_i)
+        return alpha[:, None] * (self.dense.message(h_j) + self.dense.edge_message(r))
+
+
+def test_object_attention_is_torch_geometrics_message_passing() -> None:
+    torch.manual_seed(0)
+    ours, state = ObjectAttention(NAMES, 16), states(6)
+    sparse, edges = SparseObjectAttention(ours), complete(3)
+    with torch.no_grad():
+        nodes, relations, mine = ours._nodes(state), ours._relations(state), ours(state, state)
+        for i in range(len(state)):
+            out = sparse(nodes[i], edges, relations[i].reshape(9, 7))
+            torch.testing.assert_close(out.flatten(), mine[i], atol=1e-5, rtol=1e-5)
+
+
+def test_relational_coordinates_are_poses_in_the_objects_frame() -> None:
+    frame = RelationalCoordinates(NAMES, NAMES[16:], [*ACTION_NAMES, *NAMES])
+    state = states(4)
+    seen = frame.encode_state(state)
+    torch.testing.assert_close(seen[:, 16:], state[:, 16:])
+    torch.testing.assert_close(seen[:, [7, 15]], state[:, [7, 15]])
+    for row, other in zip(state.double().numpy(), seen.double().numpy(), strict=True):
+        expected = Pose.from_vector(row[16:]).inverse() @ Pose.from_vector(row[8:15])
+        given = Pose.from_vector(other[8:15]).aligned_to(expected.quaternion)
+        assert given.position == pytest.approx(expected.position, abs=1e-5)
+        assert given.quaternion == pytest.approx(expected.quaternion, abs=1e-5)
+    output = torch.cat([states(4)[:, :16], states(4)], dim=-1)[:, None].repeat(1, 5, 1)
+    back = frame.decode_output(frame.encode_output(output, state), state)
+    torch.testing.assert_close(back, output, atol=1e-5, rtol=1e-5)
+    with pytest.raises(ValueError, match="needs an object with a pose"):
+        RelationalCoordinates(["a", "b"], ["b"], ["a"])

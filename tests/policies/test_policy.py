@@ -9,6 +9,9 @@ import sys
 from pathlib import Path
 
 import pandas as pd
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import pytest
 import torch
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -87,6 +90,107 @@ def test_batched_and_single_give_the_same_actions(variant: str, metadata) -> Non
         for t in range(25):
             alone = policy.select_action(observation(metadata, [frame + t]))
             torch.testing.assert_close(alone[0], together[t][i], atol=1e-5, rtol=1e-4)
+
+
+def test_attention_can_be_read_by_name_at_any_step(metadata) -> None:
+    policy = build(metadata).eval()
+    with pytest.raises(RuntimeError, match="no episode is running"):
+        policy.attention()
+    for t in range(12):
+        policy.select_action(observation(metadata, [t, 70 + t]))
+        attention = policy.attention()
+        assert attention.nodes == ["left", "right", "table"]
+        assert attention.primitives == [policy.config.primitives[k] for k in policy.rollout.primitive]  # pyright: ignore
+        for weights in (attention.planner, attention.dynamics):
+            assert weights.shape == (2, 3, 3)
+            torch.testing.assert_close(weights.sum(-1), torch.ones(2, 3))
+
+
+def test_latent_is_sampled_in_training_and_steady_afterwards(metadata) -> None:
+    policy = build(metadata, latent="variational", samples=3)
+    rows = torch.tensor([0, 15])
+    window = policy._demonstrations.window(rows, 0, 12)  # pyright: ignore
+
+    def predict() -> torch.Tensor:
+        return policy._predict(window.state, window.primitive, window.elapsed)[0]
+
+    policy.train()
+    assert not torch.equal(predict(), predict())
+    policy.eval()
+    sampled = predict()
+    assert torch.equal(sampled, predict())
+    policy.config.samples = 0
+    mean = predict()
+    assert torch.equal(mean, predict())
+    assert not torch.allclose(mean, sampled)
+
+
+def test_divergence_is_that_of_gaussians(metadata) -> None:
+    from torch.distributions import Normal, kl_divergence
+
+    policy = build(metadata, latent="variational", kl_weight=0.1)
+    kept = {}
+    model = policy.dynamics[0]
+    model.latent.register_forward_hook(lambda module, args, out: kept.update(latent=out.detach()))
+    window = policy._demonstrations.window(torch.tensor([0]), 0, 12)  # pyright: ignore
+    _, divergence = policy._predict(window.state, window.primitive, window.elapsed)
+    mean, log_variance = kept["latent"].chunk(2, dim=-1)
+    expected = kl_divergence(Normal(mean, (0.5 * log_variance).exp()), Normal(0.0, 1.0)).sum(-1)
+    torch.testing.assert_close(divergence, expected)
+    free = policy.forward({"index": torch.arange(8)})[1]
+    policy.config.kl_weight = 0.0
+    torch.manual_seed(1)
+    without = policy.forward({"index": torch.arange(8)})[0]
+    policy.config.kl_weight = 0.1
+    torch.manual_seed(1)
+    with_it = policy.forward({"index": torch.arange(8)})[0]
+    assert with_it.item() - without.item() == pytest.approx(0.1 * free["latent_divergence"], rel=1e-3)
+
+
+def test_one_primitive_and_one_episode_and_a_batch_of_one(copy: Path) -> None:
+    """K = 1: a dataset that labels everything with one primitive. Then one episode alone."""
+    for file in (copy / "data").glob("*/*.parquet"):
+        frame = pd.read_parquet(file)
+        table = pq.read_table(file)
+        label = pa.array([0] * len(frame), pa.int64())
+        table = table.set_column(table.column_names.index("subtask_index"), "subtask_index", label)
+        pq.write_table(table.filter(pc.equal(table["episode_index"], 0)), file)
+    names = pd.DataFrame({"subtask_index": [0]}, index=pd.Index(["lift"], name="subtask"))
+    names.to_parquet(copy / "meta/subtasks.parquet")
+    policy = build(LeRobotDatasetMetadata("hdril/test", root=copy))
+    assert policy.config.primitives == ["lift"]
+    assert policy.config.primitive_lengths == [[70, 70]]
+    loss, info = policy.forward({"index": torch.tensor([3])})
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert info["planner_accuracy"] == 1.0
+    policy.eval()
+    actions = [policy.select_action(observation(policy_metadata(copy), [t])) for t in range(70)]
+    assert all(action.shape == (1, 16) for action in actions)
+
+
+def policy_metadata(root: Path) -> LeRobotDatasetMetadata:
+    return LeRobotDatasetMetadata("hdril/test", root=root)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_preset_is_what_its_name_says(preset: str) -> None:
+    config = HDRILConfig(device="cpu", push_to_hub=False, preset=preset)
+    for name, value in PRESETS[preset].items():
+        assert getattr(config, name) == value
+    assert (config.coordinates == "relational") == preset.endswith("_relational")
+    assert config.per_primitive == ("multi" in preset or preset.startswith("hdril"))
+    assert config.skip == (preset.startswith(("res", "hdril")))
+    assert (config.interaction == "none") == preset.startswith(("gru_gru", "res_", "res_multi")) or preset == "res"
+
+
+def test_preset_that_is_unknown_or_contradicted() -> None:
+    with pytest.raises(ValueError, match=r"unknown policy\.preset 'gat'; choose from: gru_gru, res, "):
+        HDRILConfig(device="cpu", push_to_hub=False, preset="gat")
+    with pytest.raises(
+        ValueError, match=r"policy\.preset=res makes policy\.interaction 'none', but 'scalar' was given"
+    ):
+        HDRILConfig(device="cpu", push_to_hub=False, preset="res", interaction="scalar")
 
 
 def test_learns_names_and_primitives_from_the_dataset(metadata, tmp_path: Path) -> None:
@@ -278,6 +382,10 @@ def test_loss_that_is_not_finite(metadata) -> None:
         ({"rollout": "sideways"}, "closed_loop, open_loop"),
         ({"hidden_dim": 0}, "at least 1"),
         ({"replan_every": -1}, "0 \\(never\\)"),
+        ({"coordinates": "polar"}, "absolute, relational"),
+        ({"latent": "quantum"}, "deterministic, variational"),
+        ({"kl_weight": -1.0}, "must not be negative"),
+        ({"samples": 5}, "policy.latent=variational"),
     ],
 )
 def test_config_names_the_choices(values: dict, message: str) -> None:
