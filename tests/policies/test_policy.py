@@ -165,12 +165,9 @@ def test_one_primitive_and_one_episode_and_a_batch_of_one(copy: Path) -> None:
     assert torch.isfinite(loss)
     assert info["planner_accuracy"] == 1.0
     policy.eval()
-    actions = [policy.select_action(observation(policy_metadata(copy), [t])) for t in range(70)]
+    one = LeRobotDatasetMetadata("hdril/test", root=copy)
+    actions = [policy.select_action(observation(one, [t])) for t in range(5)]
     assert all(action.shape == (1, 16) for action in actions)
-
-
-def policy_metadata(root: Path) -> LeRobotDatasetMetadata:
-    return LeRobotDatasetMetadata("hdril/test", root=root)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -250,6 +247,22 @@ def test_open_loop_does_not_look(metadata) -> None:
     looking = build(metadata, rollout="closed_loop").eval()
     seeing = [looking.select_action(observation(metadata, [t])) for t in range(30)]
     assert not torch.allclose(torch.stack(seeing), torch.stack(blind))
+
+
+def test_replanning_is_limited_to_what_was_trained(metadata, tmp_path: Path) -> None:
+    build(metadata, replan_every=4).save_pretrained(tmp_path / "four")
+    for fine in (0, 4, 8):
+        config = HDRILConfig.from_pretrained(tmp_path / "four", cli_overrides=[f"--replan_every={fine}"])
+        assert HDRILPolicy.from_pretrained(tmp_path / "four", config=config).config.replan_every == fine
+    config = HDRILConfig.from_pretrained(tmp_path / "four", cli_overrides=["--replan_every=3"])
+    with pytest.raises(
+        ValueError, match="must be 0 or a multiple of 4, because the checkpoint was trained with 4; got 3"
+    ):
+        HDRILPolicy.from_pretrained(tmp_path / "four", config=config)
+    build(metadata).save_pretrained(tmp_path / "none")
+    config = HDRILConfig.from_pretrained(tmp_path / "none", cli_overrides=["--replan_every=5"])
+    with pytest.raises(ValueError, match="must be 0, because the checkpoint was trained with 0; got 5"):
+        HDRILPolicy.from_pretrained(tmp_path / "none", config=config)
 
 
 def test_padding_does_not_count(metadata) -> None:

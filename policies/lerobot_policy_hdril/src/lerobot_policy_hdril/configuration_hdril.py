@@ -61,7 +61,8 @@ class HDRILConfig(PreTrainedConfig):
     rollout: Rollout = "closed_loop"
     """``closed_loop`` looks again at every re-plan; ``open_loop`` chains predictions from the first state (the paper)."""
     replan_every: int = 0
-    """Look again every so many frames within a primitive as well; 0: at its start alone."""
+    """Look again every so many frames within a primitive as well; 0: at its start alone. A policy that was trained with
+    n can be run with 0 and with any multiple of n."""
 
     # Sizes.
     hidden_dim: int = 128
@@ -91,6 +92,8 @@ class HDRILConfig(PreTrainedConfig):
     primitives: list[str] = field(default_factory=list)
     primitive_lengths: list[list[int]] = field(default_factory=list)
     """Shortest and longest run of each primitive, frames."""
+    trained_replan_every: int = -1
+    """``replan_every`` in training, which decides where in a primitive predictions can start; -1 before."""
     state_names: list[str] = field(default_factory=list)
     environment_names: list[str] = field(default_factory=list)
     action_names: list[str] = field(default_factory=list)
@@ -156,6 +159,26 @@ class HDRILConfig(PreTrainedConfig):
         self._learn("state_names", feature_names(OBS_STATE, features[OBS_STATE]))
         self._learn("environment_names", feature_names(OBS_ENV_STATE, features[OBS_ENV_STATE]))
         self._learn("action_names", feature_names(ACTION, features[ACTION]))
+
+    def learn_replanning(self) -> None:
+        """Keep ``replan_every``: training starts.
+
+        Raises:
+            ValueError: the checkpoint was trained to look again at other frames.
+        """
+        if self.trained_replan_every < 0:
+            self.trained_replan_every = self.replan_every
+        self.check_replanning()
+
+    def check_replanning(self) -> None:
+        """Raises ValueError unless the policy learned to predict from every frame at which it is to look again."""
+        trained, wanted = self.trained_replan_every, self.replan_every
+        if trained < 0 or not wanted or (trained and wanted % trained == 0):
+            return
+        valid = f"0 or a multiple of {trained}" if trained else "0"
+        raise ValueError(
+            f"policy.replan_every must be {valid}, because the checkpoint was trained with {trained}; got {wanted}"
+        )
 
     def learn_primitives(self, primitives: list[str], lengths: list[list[int]]) -> None:
         """Keep the dataset's primitives and their lengths.

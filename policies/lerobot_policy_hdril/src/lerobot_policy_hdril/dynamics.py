@@ -17,18 +17,19 @@ class StateSkip(nn.Module):
     network is left with the rest.
     """
 
-    def __init__(self, state_dim: int, out_dim: int, steps: int) -> None:
+    def __init__(self, state_dim: int, out_dim: int, steps: int, stride: int) -> None:
         super().__init__()
+        self.stride = stride or steps
         # One map per (first step, step): a plan made in the middle of a primitive weighs the state differently.
-        self.weight = nn.Parameter(torch.zeros(steps, steps, out_dim, state_dim))
+        self.weight = nn.Parameter(torch.zeros(-(-steps // self.stride), steps, out_dim, state_dim))
 
     def forward(self, normalised: Tensor, steps: Tensor) -> Tensor:
-        """States (B, S) and step numbers (B, M) to (B, M, out_dim)."""
+        """States (B, S) and step numbers (B, M), which start at multiples of the stride, to (B, M, out_dim)."""
         firsts = steps[:, 0].unique().tolist()
         result = normalised.new_zeros(*steps.shape, self.weight.shape[2])
         for first in firsts:
             mine = (steps[:, 0] == first).nonzero().squeeze(-1)
-            part = torch.einsum("bs,mos->bmo", normalised[mine], self.weight[first, steps[mine[0]]])
+            part = torch.einsum("bs,mos->bmo", normalised[mine], self.weight[first // self.stride, steps[mine[0]]])
             result = result.index_copy(0, mine, part)
         return result
 
@@ -55,6 +56,7 @@ class PrimitiveDynamics(nn.Module):
         hidden_dim: int,
         node_dim: int,
         state_skip: bool,
+        stride: int,
         variational: bool,
     ) -> None:
         super().__init__()
@@ -69,7 +71,7 @@ class PrimitiveDynamics(nn.Module):
         self.variational = variational
         self.decoder = DECODERS[decoder](hidden_dim, steps)
         self.head = nn.Sequential(nn.Linear(2 * hidden_dim, hidden_dim), nn.SiLU(), nn.Linear(hidden_dim, out_dim))
-        self.state_skip = StateSkip(len(names), out_dim, steps) if state_skip else None
+        self.state_skip = StateSkip(len(names), out_dim, steps, stride) if state_skip else None
 
     skip_columns: Tensor
 

@@ -95,6 +95,7 @@ class HDRILPolicy(PreTrainedPolicy):
             config.set_dataset_feature_metadata(dataset_meta.features)
             self._demonstrations = Demonstrations(dataset_meta, config.subtask_key, config.device or "cpu")
             config.learn_primitives(self._demonstrations.primitives, self._demonstrations.lengths)
+            config.learn_replanning()
         if not config.primitives:
             raise ValueError(
                 "hdril learns its primitives from a dataset: train it with lerobot-train, or load a checkpoint"
@@ -110,6 +111,7 @@ class HDRILPolicy(PreTrainedPolicy):
         config = self.config
         names = [*config.state_names, *config.environment_names]
         state_dim, action_dim = len(names), len(config.action_names)
+        config.check_replanning()
         self.longest = max(longest for _, longest in config.primitive_lengths)
         models = len(config.primitives) if config.per_primitive else 1
         self.dynamics = nn.ModuleList(
@@ -124,6 +126,7 @@ class HDRILPolicy(PreTrainedPolicy):
                 hidden_dim=config.hidden_dim,
                 node_dim=config.node_dim,
                 state_skip=config.state_skip,
+                stride=max(config.trained_replan_every, 0),
                 variational=config.latent == "variational",
             )
             for _ in range(models)
@@ -197,7 +200,7 @@ class HDRILPolicy(PreTrainedPolicy):
             raise RuntimeError("this policy was loaded without a dataset: train it with lerobot-train")
         rows = self._demonstrations.rows(batch["index"].flatten())
         dynamics_loss, divergence = self._dynamics_loss(
-            self._demonstrations.window(rows, self.config.replan_every, self.longest)
+            self._demonstrations.window(rows, self.config.trained_replan_every, self.longest)
         )
         planner_loss, accuracy = self._planner_loss(
             self._demonstrations.history(rows[: self.config.planner_batch_size])
