@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -18,6 +19,7 @@ from hdril.conditions import ROBOT
 from hdril.control import ACTION_NAMES
 from hdril.demonstrator import Demonstrator, Observation
 from hdril.env import BimanualEnv
+from hdril.files import cache_folder, write_atomically
 from hdril.metrics import trajectory_error
 from hdril.primitives import Noise
 from hdril.recording import Provenance, read_provenance
@@ -94,6 +96,14 @@ class Outcome:
     """Frames of the expert's primitive (row) at which the planner preferred each (column); empty without a planner."""
     planner_boundary_hits: list[bool] = field(default_factory=list)
     """For each primitive of the expert, whether the planner preferred it at its first frame."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What an episode is compared with: the noise-free expert's states (T + 1, 16) and labels (T,) on the same seed."""
+
+    state: NDArray[np.float32]
+    scripted: NDArray[np.int64]
 
 
 Act = Callable[[Observation], Move]
@@ -220,7 +230,32 @@ def demonstrate_trace(env: BimanualEnv, expert: Demonstrator, seed: int) -> Trac
     return run_episode(env, act, seed, labels)[0]
 
 
-def judge(task: Task, seed: int, trace: Trace, reference: Trace, success: bool, unmet: str) -> Outcome:
+class ReferenceCache:
+    """The expert's episodes on disk, by seed: several policies on the same seeds need each of them once.
+
+    They lie in ``$XDG_CACHE_HOME/hdril/expert`` (``~/.cache`` unless set), under a digest of the task and of this
+    package's source: another version of the code plays them anew.
+    """
+
+    def __init__(self, env: BimanualEnv) -> None:
+        self._env, self._expert = env, Demonstrator(env.task_spec, Noise(0.0))
+        digest = hashlib.sha256(env.task.encode())
+        for file in sorted(Path(__file__).parent.rglob("*.py")):
+            digest.update(file.read_bytes())
+        self._folder = cache_folder() / "expert" / digest.hexdigest()[:16]
+
+    def get(self, seed: int) -> Reference:
+        """The expert's episode of this seed, played now unless it is there."""
+        path = self._folder / f"{seed}.npz"
+        if path.exists():
+            with np.load(path) as data:
+                return Reference(data["state"], data["scripted"])
+        trace = demonstrate_trace(self._env, self._expert, seed)
+        write_atomically(path, lambda file: np.savez(file, state=trace.state, scripted=trace.scripted))
+        return Reference(trace.state, trace.scripted)
+
+
+def judge(task: Task, seed: int, trace: Trace, reference: Reference, success: bool, unmet: str) -> Outcome:
     """Compare an episode with the expert's."""
     error = trajectory_error(trace.state, reference.state)
     names = np.array(task.labels)
@@ -289,13 +324,13 @@ class Worker:
 
     def __post_init__(self) -> None:
         self.env = BimanualEnv(self.job.task)
-        self._expert = Demonstrator(self.env.task_spec, Noise(0.0))
+        self._references = ReferenceCache(self.env)
         self._actor = LeRobotActor(self.job.policy, self.env.task_spec, self.job.overrides, self.job.device)
 
     def run(self, seed: int) -> Outcome:
         """Expert and policy on the scene of ``seed``; writes the Rerun file if the episode is to be kept."""
         task = self.env.task_spec
-        reference = demonstrate_trace(self.env, self._expert, seed)
+        reference = self._references.get(seed)
         self._actor.reset(seed)
         trace, success, unmet = run_episode(self.env, self._actor.act, seed, reference.scripted, self._actor.nodes)
         outcome = judge(task, seed, trace, reference, success, unmet)

@@ -16,7 +16,7 @@ from hdril.metrics import hand_poses
 from hdril.robots.spec import SIDES
 
 if TYPE_CHECKING:
-    from hdril.evaluation import Outcome, Trace
+    from hdril.evaluation import Outcome, Reference, Trace
 
 TIMELINE = "time"
 WORLD_FRAME = "tf#/world"  # the frame that Rerun gives the entity "world"; the robot's own frames hang below it
@@ -32,7 +32,7 @@ def recording_name(outcome: Outcome) -> str:
     return f"seed_{outcome.seed:07d}_{'success' if outcome.success else 'failure'}"
 
 
-def write_recording(folder: Path, env: BimanualEnv, outcome: Outcome, trace: Trace, reference: Trace) -> Path:
+def write_recording(folder: Path, env: BimanualEnv, outcome: Outcome, trace: Trace, reference: Reference) -> Path:
     """Write ``<folder>/<recording_name>.rrd``. Times are seconds from the start of the episode."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{recording_name(outcome)}.rrd"

@@ -13,7 +13,16 @@ import pytest
 
 from hdril.demonstrator import Demonstrator
 from hdril.env import BimanualEnv
-from hdril.evaluation import Outcome, Trace, check_held_out, demonstrate_trace, judge, training_provenance
+from hdril.evaluation import (
+    Outcome,
+    Reference,
+    ReferenceCache,
+    Trace,
+    check_held_out,
+    demonstrate_trace,
+    judge,
+    training_provenance,
+)
 from hdril.metrics import trajectory_error
 from hdril.primitives import Noise
 from hdril.recording import Provenance, Recipe
@@ -56,12 +65,16 @@ def test_errors_of_a_known_offset() -> None:
     np.testing.assert_allclose(trajectory_error(turned, straight(50)).angle, 0.05)  # one hand of two by 0.1 rad
 
 
+def expert_of(trace: Trace) -> Reference:
+    return Reference(trace.state, trace.scripted)
+
+
 @pytest.fixture(scope="module")
 def played() -> tuple[BimanualEnv, Trace, Outcome]:
     """The expert's episode of a seed, judged against itself."""
     env = BimanualEnv("table_lift")
     trace = demonstrate_trace(env, Demonstrator(env.task_spec, Noise(0.0)), 940_000)
-    return env, trace, judge(env.task_spec, 940_000, trace, trace, True, "")
+    return env, trace, judge(env.task_spec, 940_000, trace, expert_of(trace), True, "")
 
 
 def test_the_expert_has_no_error_against_itself(played) -> None:
@@ -71,6 +84,17 @@ def test_the_expert_has_no_error_against_itself(played) -> None:
     assert set(outcome.position_error_cm_by_primitive) == set(env.task_spec.labels)
     assert trace.state.shape == (71, 16)
     assert trace.joints.shape == (71, 18)
+
+
+def test_the_experts_episode_is_played_once(played, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    env, trace, _ = played
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    first = ReferenceCache(env).get(940_000)
+    np.testing.assert_array_equal(first.state, trace.state)
+    monkeypatch.setattr("hdril.evaluation.demonstrate_trace", None)  # playing again would fail
+    again = ReferenceCache(env).get(940_000)
+    np.testing.assert_array_equal(again.state, first.state)
+    np.testing.assert_array_equal(again.scripted, first.scripted)
 
 
 def read_back(path: Path) -> str:
@@ -83,7 +107,7 @@ def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path:
     env, trace, outcome = played
     failed = replace(outcome, success=False, unmet="table at rest")
     wrong = replace(trace, beliefs=tuple(replace(b, primitive=1) if b.primitive == 2 else b for b in trace.beliefs))
-    path = write_recording(tmp_path, env, failed, wrong, trace)
+    path = write_recording(tmp_path, env, failed, wrong, expert_of(trace))
     assert path.name == "seed_0940000_failure.rrd"
     assert recording_name(outcome) == "seed_0940000_success"
     text = read_back(path)
@@ -114,12 +138,12 @@ def test_planner_is_scored_by_frames_and_at_boundaries(played) -> None:
     first = int(np.flatnonzero(trace.scripted == lift)[0])
     beliefs = list(trace.beliefs)
     beliefs[first] = replace(beliefs[first], probabilities=np.eye(6)[move])
-    outcome = judge(env.task_spec, 0, replace(trace, beliefs=tuple(beliefs)), trace, True, "")
+    outcome = judge(env.task_spec, 0, replace(trace, beliefs=tuple(beliefs)), expert_of(trace), True, "")
     assert outcome.planner_confusion[lift][move] == 1
     assert np.trace(outcome.planner_confusion) == 69
     assert outcome.planner_boundary_hits == [True, True, False, True, True, True]
     nobody = replace(trace, beliefs=(None,) * len(trace.beliefs))
-    assert judge(env.task_spec, 0, nobody, trace, True, "").planner_confusion == []
+    assert judge(env.task_spec, 0, nobody, expert_of(trace), True, "").planner_confusion == []
 
 
 def test_report_says_what_happened(played, tmp_path: Path) -> None:

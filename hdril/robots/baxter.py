@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import tempfile
 import xml.etree.ElementTree as ElementTree
 from functools import cache
 from importlib.metadata import files
 from itertools import combinations
 from pathlib import Path
 
+from hdril.files import cache_folder, write_atomically
 from hdril.geometry import Pose
 from hdril.robots.spec import Actuation, ArmSpec, GripperSpec, RobotSpec
 
@@ -97,15 +96,10 @@ def _prepare(link: ElementTree.Element, meshes: bool) -> None:
 
 
 def _write_once(text: str, stem: str) -> Path:
-    """A cached file with this content. Written atomically: two processes may start at once."""
-    cache_root = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "hdril"
-    path = cache_root / f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.urdf"
+    """A cached file with this content."""
+    path = cache_folder() / f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.urdf"
     if not path.exists():
-        cache_root.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(dir=cache_root, suffix=".part")
-        with os.fdopen(descriptor, "w") as file:
-            file.write(text)
-        os.replace(temporary, path)
+        write_atomically(path, lambda file: file.write(text.encode()))
     return path
 
 
