@@ -74,13 +74,13 @@ class HDRILConfig(PreTrainedConfig):
     # Losses.
     state_loss_weight: float = 0.5
     """Weight of the predicted states beside that of the actions."""
+    ridge: float = 1.0
+    """Penalty on the squared weights of the linear maps (``state_skip``), which are solved before training."""
     min_std: float = 0.01
     """Floor of the deviations that normalise the data, m or dimensionless: what hardly moves must not dominate."""
 
     # Optimisation.
     optimizer_lr: float = 1e-3
-    optimizer_lr_state_skip: float = 3e-2
-    """The linear maps start at 0 and must reach 1; at the network's rate Adam would take a thousand steps for that."""
     optimizer_weight_decay: float = 1e-4
     optimizer_grad_clip_norm: float = 1.0
     scheduler_warmup_share: float = 0.03
@@ -119,6 +119,8 @@ class HDRILConfig(PreTrainedConfig):
         for name in ("hidden_dim", "node_dim", "planner_hidden_dim", "planner_batch_size"):
             if getattr(self, name) < 1:
                 raise ValueError(f"policy.{name} must be at least 1, got {getattr(self, name)}")
+        if self.ridge <= 0:
+            raise ValueError(f"policy.ridge must be above 0, got {self.ridge}")
         if self.kl_weight < 0 or self.samples < 0:
             raise ValueError(
                 f"policy.kl_weight and policy.samples must not be negative, got {self.kl_weight} and {self.samples}"

@@ -139,6 +139,13 @@ class Demonstrations:
         """Rows (segments,) at which a primitive begins."""
         return self._segment_bounds[:, 0]
 
+    def look_rows(self, stride: int) -> Tensor:
+        """Rows at which a rollout looks: every ``stride`` frames of a primitive, or at its start alone if it is 0."""
+        if not stride:
+            return self.segment_starts
+        rows = torch.arange(len(self.segment), device=self.segment.device)
+        return rows[(rows - self._segment_bounds[self.segment, 0]) % stride == 0]
+
     def rows(self, index: Tensor) -> Tensor:
         """Rows of the frames with these values of ``index`` (B,)."""
         rows = torch.searchsorted(self.index, index)

@@ -13,23 +13,56 @@ class StateSkip(nn.Module):
     """A linear map from the state to the output of each step: ours, beside the paper's skip into the latent.
 
     A scripted or taught movement is close to linear in where it starts from and what it goes to, with other weights at
-    each step; least squares alone predicts the last hand position of a primitive of table lift to 0.3 to 0.8 mm. The
-    network is left with the rest.
+    each step. The maps are solved by ridge regression before training and then stay; the network learns the rest. Learned
+    by gradient descent instead they fit as well, but answer wildly to states a little beside the demonstrated ones: on
+    peg-in-hole 32 of 40 episodes succeeded so, and all of the first 16 seeds tried with ridge regression.
     """
 
     def __init__(self, state_dim: int, out_dim: int, steps: int, stride: int) -> None:
         super().__init__()
         self.stride = stride or steps
         # One map per (first step, step): a plan made in the middle of a primitive weighs the state differently.
-        self.weight = nn.Parameter(torch.zeros(-(-steps // self.stride), steps, out_dim, state_dim))
+        starts = -(-steps // self.stride)
+        self.register_buffer("weight", torch.zeros(starts, steps, out_dim, state_dim))
+        self.register_buffer("bias", torch.zeros(starts, steps, out_dim))
+
+    weight: Tensor
+    bias: Tensor
+
+    @torch.no_grad()
+    def fit(self, normalised: Tensor, steps: Tensor, target: Tensor, mask: Tensor, ridge: float) -> None:
+        """Solve the maps, in float64: W_i minimises sum_n |W_i [s_n || 1] - y_ni|^2 + ridge |W_i|^2, the bias is free.
+
+        Args:
+            normalised: states (N, S) at which windows start.
+            steps: step numbers (N, M); a window starts at a multiple of the stride.
+            target: normalised outputs (N, M, W).
+            mask: (N, M), True where there is a target.
+            ridge: weight of the penalty; keeps the answer small in directions that the demonstrations do not vary in.
+        """
+        inputs = torch.cat([normalised, torch.ones_like(normalised[:, :1])], dim=-1).double()
+        penalty = ridge * torch.eye(inputs.shape[1], dtype=torch.float64, device=inputs.device)
+        penalty[-1, -1] = 1e-6
+        for first in steps[:, 0].unique().tolist():
+            mine = (steps[:, 0] == first).nonzero().squeeze(-1)
+            for i in range(steps.shape[1]):
+                rows = mine[mask[mine, i]]
+                if len(rows) == 0:
+                    continue
+                x, y = inputs[rows], target[rows, i].double()
+                solution = torch.linalg.solve(x.T @ x + penalty, x.T @ y).T.to(self.weight)
+                step = int(steps[rows[0], i])
+                self.weight[first // self.stride, step] = solution[:, :-1]
+                self.bias[first // self.stride, step] = solution[:, -1]
 
     def forward(self, normalised: Tensor, steps: Tensor) -> Tensor:
-        """States (B, S) and step numbers (B, M), which start at multiples of the stride, to (B, M, out_dim)."""
+        """States (B, S) and step numbers (B, M), which start at multiples of the stride, to (B, M, W)."""
         firsts = steps[:, 0].unique().tolist()
         result = normalised.new_zeros(*steps.shape, self.weight.shape[2])
         for first in firsts:
             mine = (steps[:, 0] == first).nonzero().squeeze(-1)
-            part = torch.einsum("bs,mos->bmo", normalised[mine], self.weight[first // self.stride, steps[mine[0]]])
+            row, columns = first // self.stride, steps[mine[0]]
+            part = torch.einsum("bs,mos->bmo", normalised[mine], self.weight[row, columns]) + self.bias[row, columns]
             result = result.index_copy(0, mine, part)
         return result
 
@@ -72,6 +105,9 @@ class PrimitiveDynamics(nn.Module):
         self.decoder = DECODERS[decoder](hidden_dim, steps)
         self.head = nn.Sequential(nn.Linear(2 * hidden_dim, hidden_dim), nn.SiLU(), nn.Linear(hidden_dim, out_dim))
         self.state_skip = StateSkip(len(names), out_dim, steps, stride) if state_skip else None
+        if state_skip:  # the network starts from what the linear maps leave: nothing
+            nn.init.zeros_(self.head[-1].weight)  # pyright: ignore
+            nn.init.zeros_(self.head[-1].bias)  # pyright: ignore
 
     skip_columns: Tensor
 

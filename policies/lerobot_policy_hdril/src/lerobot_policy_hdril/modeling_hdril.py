@@ -103,8 +103,11 @@ class HDRILPolicy(PreTrainedPolicy):
         self._build()
         if dataset_stats is not None:
             self._set_normalisation(dataset_stats)
-        if self._demonstrations is not None and self.relational is not None:
-            self._set_relational_normalisation(self._demonstrations)
+        if self._demonstrations is not None:
+            if self.relational is not None:
+                self._set_relational_normalisation(self._demonstrations)
+            if config.state_skip:
+                self._fit_state_skips(self._demonstrations)
         self.reset()
 
     def _build(self) -> None:
@@ -178,11 +181,18 @@ class HDRILPolicy(PreTrainedPolicy):
             getattr(self, f"{name}_mean").copy_(values.mean(0))
             getattr(self, f"{name}_std").copy_(values.std(0).clamp_min(self.config.min_std))
 
-    def get_optim_params(self) -> list[dict[str, Any]]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Two groups: the network, and the linear maps at a rate of their own."""
-        skips = [p for name, p in self.named_parameters() if ".state_skip." in name]
-        others = [p for name, p in self.named_parameters() if ".state_skip." not in name]
-        return [{"params": others}, {"params": skips, "lr": self.config.optimizer_lr_state_skip}]
+    def _fit_state_skips(self, demonstrations: Demonstrations) -> None:
+        """Solve the linear maps on all windows that training can draw."""
+        window = demonstrations.window(demonstrations.look_rows(self.config.trained_replan_every),
+                                       self.config.trained_replan_every, self.longest)  # fmt: skip
+        normalised, target, steps = self._normalise(window.state), self._target(window), self._steps(window.elapsed)
+        for k, model in enumerate(self.dynamics):
+            mine = window.primitive == k if self.config.per_primitive else torch.ones_like(window.primitive).bool()
+            model.state_skip.fit(normalised[mine], steps[mine], target[mine], window.mask[mine], self.config.ridge)  # pyright: ignore
+
+    def get_optim_params(self) -> dict[str, Any]:
+        """All parameters, in one group."""
+        return self.parameters()  # pyright: ignore
 
     # ------------------------------------------------------------------ training
 
@@ -223,12 +233,20 @@ class HDRILPolicy(PreTrainedPolicy):
     def _dynamics_loss(self, window: Window) -> tuple[Tensor, Tensor]:
         """Mean squared error and mean divergence of the latent, nats."""
         predicted, divergence = self._predict(window.state, window.primitive, window.elapsed)
+        error = (predicted - self._target(window)).square() @ self.loss_weights  # (B, M)
+        return (error * window.mask).sum() / window.mask.sum(), divergence.mean()
+
+    def _target(self, window: Window) -> Tensor:
+        """Normalised actions and states (B, M, A + S) that the dynamics are to predict."""
         target = window.target
         if self.relational is not None:
             target = self.relational.encode_output(target, window.state)
-        target = (target - self.output_mean) / self.output_std
-        error = (predicted - target).square() @ self.loss_weights  # (B, M)
-        return (error * window.mask).sum() / window.mask.sum(), divergence.mean()
+        return (target - self.output_mean) / self.output_std
+
+    def _steps(self, elapsed: Tensor) -> Tensor:
+        """Numbers (B, M) of the steps of a window that starts ``elapsed`` (B,) frames into its primitive."""
+        ahead = torch.arange(self.longest, device=elapsed.device)
+        return (elapsed[:, None] + ahead).clamp_max(self.longest - 1)
 
     def _planner_loss(self, history: History) -> tuple[Tensor, float]:
         logits, _ = self.planner(self._normalise(history.state), history.state)
@@ -245,7 +263,7 @@ class HDRILPolicy(PreTrainedPolicy):
         """Normalised actions and states (B, M, A + S), and divergence of the latent (B,), nats, from raw states (B, S),
         ``elapsed`` (B,) frames into primitives."""
         normalised, samples = self._normalise(state), self.config.samples
-        steps = (elapsed[:, None] + torch.arange(self.longest, device=state.device)).clamp_max(self.longest - 1)
+        steps = self._steps(elapsed)
         if not self.config.per_primitive:
             context = F.one_hot(primitive, len(self.config.primitives)).to(state.dtype)
             return self.dynamics[0](normalised, state, context, steps, samples)
