@@ -106,8 +106,27 @@ def test_attention_can_be_read_by_name_at_any_step(metadata) -> None:
             torch.testing.assert_close(weights.sum(-1), torch.ones(2, 3))
 
 
+def test_linear_maps_are_the_ridge_solution(metadata) -> None:
+    """Without a penalty to speak of, they fit a linear relation exactly, from every frame at which a window starts."""
+    policy = build(metadata, replan_every=5)
+    maps = policy.dynamics[2].state_skip
+    generator = torch.Generator().manual_seed(0)
+    states = torch.randn(200, 23, generator=generator)
+    truth = torch.randn(39, 23, generator=generator)
+    steps = torch.arange(12) + torch.tensor([0, 5, 10]).repeat(67)[:200, None]
+    mask = steps < 12
+    steps = steps.clamp_max(11)
+    target = (states @ truth.T)[:, None] * (1.0 + steps[..., None]) + 3.0
+    maps.fit(states, steps, target, mask, 1e-9)
+    torch.testing.assert_close(maps(states, steps)[mask], target[mask], atol=1e-2, rtol=1e-3)
+    maps.fit(states, steps, target, mask, 1e9)
+    assert maps.weight.abs().max() < 1e-3
+    policy.forward({"index": torch.arange(40)})[0].backward()
+    assert all(".state_skip." not in name for name, _ in policy.named_parameters())
+
+
 def test_latent_is_sampled_in_training_and_steady_afterwards(metadata) -> None:
-    policy = build(metadata, latent="variational", samples=3)
+    policy = build(metadata, latent="variational", samples=3, state_skip=False)
     rows = torch.tensor([0, 15])
     window = policy._demonstrations.window(rows, 0, 12)  # pyright: ignore
 
@@ -398,6 +417,7 @@ def test_loss_that_is_not_finite(metadata) -> None:
         ({"coordinates": "polar"}, "absolute, relational"),
         ({"latent": "quantum"}, "deterministic, variational"),
         ({"kl_weight": -1.0}, "must not be negative"),
+        ({"ridge": 0.0}, "ridge must be above 0"),
         ({"samples": 5}, "policy.latent=variational"),
     ],
 )
