@@ -23,6 +23,7 @@ from hdril.files import cache_folder, write_atomically
 from hdril.metrics import trajectory_error
 from hdril.primitives import Noise
 from hdril.recording import Provenance, read_provenance
+from hdril.robots.spec import SIDES
 from hdril.tasks import Task, base_name
 
 
@@ -36,8 +37,8 @@ class Belief:
     """(K,), the planner's."""
     plan: NDArray[np.float32] | None
     """(M, 16), the actions from here to the end of the primitive, if it has just planned anew."""
-    attention: NDArray[np.float32]
-    """(N, N), of the dynamics model that plays: how much node u takes from node v."""
+    attention: dict[str, float]
+    """Share of the playing model's attention that each hand and object receives."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,9 @@ class Trace:
     ik_failures: tuple[str, ...]  # (T,), empty strings where there was none
     stage: NDArray[np.int64]  # (T + 1,), how many of the task's stages were reached, success being the last
     measures: NDArray[np.float64]  # (T + 1, measures of the task)
-    nodes: tuple[str, ...] = ()
-    """Names of the nodes of the policy's graph."""
+    ik_error: NDArray[np.float64]  # (T, 2), m: how far inverse kinematics stayed from the commands, left and right
+    grip_force: NDArray[np.float64]  # (T + 1, 2), N: what the pads of each hand press on objects with
+    contacts: dict[str, NDArray[np.bool_]]  # (T + 1,) by "first, second": whether they touch
 
     @property
     def predicted(self) -> NDArray[np.int64]:
@@ -139,9 +141,7 @@ class LeRobotActor:
         primitives = getattr(config, "primitives", None) or []
         self._labels = np.array([task.labels.index(name) if name in task.labels else -1 for name in primitives])
         self._count = len(task.labels)
-        self.nodes: tuple[str, ...] = ()
-        if primitives and hasattr(self.policy, "planner"):
-            self.nodes = tuple(self.policy.planner.graph.node_names)  # pyright: ignore
+        self._believes = bool(primitives) and hasattr(self.policy, "attention")
 
     def reset(self, seed: int) -> None:
         """Begin an episode; a policy that samples draws the same numbers for the same seed."""
@@ -160,7 +160,7 @@ class LeRobotActor:
 
     def _belief(self) -> Belief | None:
         rollout: Any = getattr(self.policy, "rollout", None)
-        if not self.nodes or rollout is None:
+        if not self._believes or rollout is None:
             return None
         probabilities = np.zeros(self._count, np.float32)
         known = self._labels >= 0
@@ -169,20 +169,34 @@ class LeRobotActor:
         if plan is not None:
             # The plan ends with the longest recorded form of this primitive.
             plan = plan[: max(1, int(self.policy.longest_length[rollout.primitive[0]] - rollout.plan_start[0]))]  # pyright: ignore
-        attention = self.policy.attention().dynamics[0].cpu().numpy()  # pyright: ignore
+        received = self.policy.attention().received()  # pyright: ignore
+        attention = {name: float(share[0]) for name, share in received.items()}
         return Belief(int(self._labels[int(rollout.primitive[0])]), probabilities, plan, attention)
 
 
-def run_episode(
-    env: BimanualEnv, act: Act, seed: int, labels: NDArray[np.int64], nodes: tuple[str, ...] = ()
-) -> tuple[Trace, bool, str]:
-    """Play the scene of ``seed``; ``labels`` are the expert's, ``nodes`` the names of those in the policy's beliefs."""
+def _contacts(env: BimanualEnv) -> tuple[NDArray[np.float64], dict[str, bool]]:
+    """Pressure (2,), N, of the pads of each hand on objects, and which bodies touch, for those that move."""
+    world, task = env.world, env.task_spec
+    force, touching = np.zeros(len(SIDES)), {}
+    for i, name in enumerate(task.observed):
+        held = world.contacts(ROBOT, name)
+        touching[f"{ROBOT}, {name}"] = bool(held)
+        for side, arm in enumerate(env.robot_spec.arms.values()):
+            force[side] += sum(contact.force for contact in held if contact.link_a in arm.gripper.pads)
+        others = [body.name for body in task.bodies if body.name not in task.observed[: i + 1]]
+        touching |= {f"{name}, {other}": bool(world.contacts(name, other)) for other in others}
+    return force, touching
+
+
+def run_episode(env: BimanualEnv, act: Act, seed: int, labels: NDArray[np.int64]) -> tuple[Trace, bool, str]:
+    """Play the scene of ``seed``; ``labels`` are the expert's."""
     observation, info = env.reset(seed=seed)
     names = [measure.name for measure in env.task_spec.measures]
     joints = env.world.joint_indices(ROBOT, env.controller.joint_names)
     observations, positions = [observation], [env.world.joint_positions(ROBOT, joints)]
     actions, rewards, beliefs, failures = [], [], [], []
     progress = [[info[key] for key in ("stage", *names)]]
+    touches, ik_errors = [_contacts(env)], []
     done = False
     while not done:
         move = act(observation)
@@ -195,6 +209,8 @@ def run_episode(
         beliefs.append(move.belief)
         failures.append(info["ik_failure"])
         progress.append([info[key] for key in ("stage", *names)])
+        touches.append(_contacts(env))
+        ik_errors.append([env.controller.results[side].position_error for side in SIDES])
     scripted = np.full(len(actions), -1)
     scripted[: len(labels)] = labels[: len(actions)]
     trace = Trace(
@@ -205,10 +221,12 @@ def run_episode(
         reward=np.array(rewards, np.float32),
         scripted=scripted,
         beliefs=tuple(beliefs),
-        nodes=nodes,
         ik_failures=tuple(failures),
         stage=np.array([row[0] for row in progress]),
         measures=np.array([row[1:] for row in progress], dtype=np.float64),
+        ik_error=np.array(ik_errors),
+        grip_force=np.stack([force for force, _ in touches]),
+        contacts={pair: np.array([touching[pair] for _, touching in touches]) for pair in touches[0][1]},
     )
     return trace, bool(info["is_success"]), str(info["unmet"])
 
@@ -221,11 +239,11 @@ def demonstrate_trace(env: BimanualEnv, expert: Demonstrator, seed: int) -> Trac
         [p.frames for p in env.task_spec.primitives],
     )
 
-    certain, nobody = np.eye(len(env.task_spec.labels), dtype=np.float32), np.zeros((0, 0), np.float32)
+    certain = np.eye(len(env.task_spec.labels), dtype=np.float32)
 
     def act(observation: Observation) -> Move:
         step = expert.act(observation)
-        return Move(step.action.astype(np.float32), Belief(step.label, certain[step.label], None, nobody))
+        return Move(step.action.astype(np.float32), Belief(step.label, certain[step.label], None, {}))
 
     return run_episode(env, act, seed, labels)[0]
 
@@ -332,7 +350,7 @@ class Worker:
         task = self.env.task_spec
         reference = self._references.get(seed)
         self._actor.reset(seed)
-        trace, success, unmet = run_episode(self.env, self._actor.act, seed, reference.scripted, self._actor.nodes)
+        trace, success, unmet = run_episode(self.env, self._actor.act, seed, reference.scripted)
         outcome = judge(task, seed, trace, reference, success, unmet)
         if self._keeps(outcome):
             from hdril.rerun_log import write_recording

@@ -24,6 +24,7 @@ COLOURS = {
     "executed": ((40, 110, 220), (220, 90, 30)),
     "commanded": ((150, 190, 250), (250, 190, 150)),
     "expert": ((120, 200, 120), (120, 200, 120)),
+    "plan": ((150, 60, 220), (220, 60, 180)),
 }
 
 
@@ -52,6 +53,7 @@ def write_recording(folder: Path, env: BimanualEnv, outcome: Outcome, trace: Tra
             stream, "expert", reference.state, np.arange(len(reference.state)) * env.world.physics.control_period
         )
         _log_primitives(stream, env, trace, times)
+        _log_beliefs(stream, env, trace, times)
         _log_scalars(stream, env, outcome, trace, times)
     return path
 
@@ -144,21 +146,67 @@ def _log_primitives(stream: rr.RecordingStream, env: BimanualEnv, trace: Trace, 
     stream.reset_time()
 
 
+def _send_scalars(
+    stream: rr.RecordingStream, entity: str, values: NDArray[np.floating], at: NDArray[np.floating]
+) -> None:
+    stream.send_columns(entity, _columns(at), rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64)))
+
+
+def _log_beliefs(stream: rr.RecordingStream, env: BimanualEnv, trace: Trace, times: NDArray[np.floating]) -> None:
+    """The planner's probabilities, who receives the model's attention, and each plan as a trail that fades to its end."""
+    frames = [i for i, belief in enumerate(trace.beliefs) if belief is not None]
+    beliefs = [belief for belief in trace.beliefs if belief is not None]
+    if not beliefs:
+        return
+    at = times[frames]
+    for label, name in enumerate(env.task_spec.labels):
+        _send_scalars(stream, f"planner/{name}", np.array([b.probabilities[label] for b in beliefs]), at)
+    for name in beliefs[0].attention:
+        _send_scalars(stream, f"attention/{name}", np.array([b.attention[name] for b in beliefs]), at)
+    for time, belief in zip(at, beliefs, strict=True):
+        if belief.plan is None or len(belief.plan) < 2:
+            continue
+        stream.set_time(TIMELINE, duration=float(time))
+        poses = hand_poses(belief.plan)
+        fading = np.linspace(255, 50, len(poses) - 1).astype(int)
+        for i, side in enumerate(SIDES):
+            path = poses[:, i, :3]
+            stream.log(
+                f"world/hands/{side}/plan",
+                rr.LineStrips3D(
+                    np.stack([path[:-1], path[1:]], axis=1),
+                    colors=[(*COLOURS["plan"][i], alpha) for alpha in fading],
+                    radii=[0.004],
+                ),
+            )
+    stream.reset_time()
+
+
 def _log_scalars(
     stream: rr.RecordingStream, env: BimanualEnv, outcome: Outcome, trace: Trace, times: NDArray[np.floating]
 ) -> None:
-    def send(entity: str, values: NDArray[np.floating], at: NDArray[np.floating]) -> None:
-        stream.send_columns(entity, _columns(at), rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64)))
-
     told, went = hand_poses(trace.action), hand_poses(trace.state[1:])
     for i, side in enumerate(SIDES):
-        send(f"tracking_error_mm/{side}", 1e3 * np.linalg.norm(told[:, i, :3] - went[:, i, :3], axis=-1), times[1:])
-        send(f"gripper/{side}/commanded", trace.action[:, 8 * i + 7], times[:-1])
-        send(f"gripper/{side}/measured", trace.state[:, 8 * i + 7], times)
-    send("reward", trace.reward, times[1:])
-    send("progress/stage", trace.stage, times)
+        _send_scalars(
+            stream,
+            f"tracking_error_mm/{side}",
+            1e3 * np.linalg.norm(told[:, i, :3] - went[:, i, :3], axis=-1),
+            times[1:],
+        )
+        _send_scalars(stream, f"gripper/{side}/commanded", trace.action[:, 8 * i + 7], times[:-1])
+        _send_scalars(stream, f"gripper/{side}/measured", trace.state[:, 8 * i + 7], times)
+        _send_scalars(stream, f"grip_force_N/{side}", trace.grip_force[:, i], times)
+        _send_scalars(stream, f"ik_error_mm/{side}", 1e3 * trace.ik_error[:, i], times[:-1])
+    for pair, touching in trace.contacts.items():
+        entity = f"contact/{pair.replace(', ', '-')}"
+        for frame in np.flatnonzero(np.diff(touching.astype(int), prepend=-1)):
+            stream.set_time(TIMELINE, duration=float(times[frame]))
+            stream.log(entity, rr.StateChange(state="touch" if touching[frame] else "apart"))
+    stream.reset_time()
+    _send_scalars(stream, "reward", trace.reward, times[1:])
+    _send_scalars(stream, "progress/stage", trace.stage, times)
     for measure, values in zip(env.task_spec.measures, trace.measures.T, strict=True):
-        send(f"progress/{measure.name}", values, times)
+        _send_scalars(stream, f"progress/{measure.name}", values, times)
     for i, failure in enumerate(trace.ik_failures):
         if failure:
             stream.set_time(TIMELINE, duration=float(times[i]))
@@ -193,12 +241,23 @@ def _blueprint(env: BimanualEnv) -> rrb.Blueprint:
                     ),
                 ),
                 rrb.StateTimelineView(origin="primitive", name="Primitives: expert's and policy's"),
-                row_shares=[4, 1],
+                rrb.StateTimelineView(origin="contact", name="Who touches whom"),
+                row_shares=[4, 1, 1],
             ),
             rrb.Vertical(
                 rrb.TextDocumentView(origin="summary", name="Outcome"),
-                rrb.TimeSeriesView(origin="tracking_error_mm", name="Hand to command, mm"),
-                rrb.TimeSeriesView(origin="gripper", name="Gripper opening"),
+                rrb.Tabs(
+                    rrb.TimeSeriesView(origin="planner", name="Planner's probabilities"),
+                    rrb.TimeSeriesView(origin="attention", name="Attention received"),
+                ),
+                rrb.Tabs(
+                    rrb.TimeSeriesView(origin="tracking_error_mm", name="Hand to command, mm"),
+                    rrb.TimeSeriesView(origin="ik_error_mm", name="Inverse kinematics, mm"),
+                ),
+                rrb.Tabs(
+                    rrb.TimeSeriesView(origin="grip_force_N", name="Grip, N"),
+                    rrb.TimeSeriesView(origin="gripper", name="Gripper opening"),
+                ),
                 rrb.TimeSeriesView(origin="progress", name="Stage and measures"),
                 rrb.TextLogView(origin="log", name="Events"),
             ),

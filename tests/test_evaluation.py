@@ -84,6 +84,13 @@ def test_the_expert_has_no_error_against_itself(played) -> None:
     assert set(outcome.position_error_cm_by_primitive) == set(env.task_spec.labels)
     assert trace.state.shape == (71, 16)
     assert trace.joints.shape == (71, 18)
+    assert trace.grip_force.shape == (71, 2)
+    assert (trace.grip_force[0] == 0.0).all()
+    assert (trace.grip_force[30] > 20.0).all(), "the hands hold the table"
+    assert trace.contacts["robot, table"][30]
+    assert not trace.contacts["robot, table"][-1]
+    assert trace.contacts["table, platform"][-1]
+    assert trace.ik_error.max() < 2e-3
 
 
 def test_the_experts_episode_is_played_once(played, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,7 +113,10 @@ def read_back(path: Path) -> str:
 def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path: Path) -> None:
     env, trace, outcome = played
     failed = replace(outcome, success=False, unmet="table at rest")
-    wrong = replace(trace, beliefs=tuple(replace(b, primitive=1) if b.primitive == 2 else b for b in trace.beliefs))
+    beliefs = [replace(b, primitive=1, attention={"table": 0.5}) if b.primitive == 2 else
+               replace(b, attention={"table": 1.0}) for b in trace.beliefs]  # fmt: skip
+    beliefs[0] = replace(beliefs[0], plan=trace.action[:10])
+    wrong = replace(trace, beliefs=tuple(beliefs))
     path = write_recording(tmp_path, env, failed, wrong, expert_of(trace))
     assert path.name == "seed_0940000_failure.rrd"
     assert recording_name(outcome) == "seed_0940000_success"
@@ -121,6 +131,14 @@ def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path:
         "/primitive/scripted",
         "/primitive/predicted",
         "/tracking_error_mm/left",
+        "/planner/grasp",
+        "/attention/table",
+        "/world/hands/right/plan",
+        "/grip_force_N/right",
+        "/ik_error_mm/left",
+        "/contact/robot-table",
+        "/contact/table-platform",
+        "/progress/stage",
         "/reward",
         "/summary",
     ):

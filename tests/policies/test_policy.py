@@ -104,6 +104,9 @@ def test_attention_can_be_read_by_name_at_any_step(metadata) -> None:
         for weights in (attention.planner, attention.dynamics):
             assert weights.shape == (2, 3, 3)
             torch.testing.assert_close(weights.sum(-1), torch.ones(2, 3))
+        received = attention.received()
+        assert list(received) == ["left", "right", "table"]
+        torch.testing.assert_close(torch.stack(list(received.values())).sum(0), torch.ones(2))
 
 
 def test_linear_maps_are_the_ridge_solution(metadata) -> None:

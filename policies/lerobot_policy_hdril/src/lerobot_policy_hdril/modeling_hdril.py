@@ -15,7 +15,7 @@ from lerobot_policy_hdril.configuration_hdril import HDRILConfig
 from lerobot_policy_hdril.coordinates import RelationalCoordinates
 from lerobot_policy_hdril.demonstrations import Demonstrations, History, Window
 from lerobot_policy_hdril.dynamics import PrimitiveDynamics
-from lerobot_policy_hdril.graph import quaternion_groups
+from lerobot_policy_hdril.graph import group_nodes, quaternion_groups
 from lerobot_policy_hdril.planner import Planner
 
 if TYPE_CHECKING:
@@ -30,6 +30,13 @@ class Attention:
     primitives: list[str]  # (B,), what each episode plays
     planner: Tensor  # (B, N, N)
     dynamics: Tensor  # (B, N, N), of the model of the primitive that plays
+
+    def received(self) -> dict[str, Tensor]:
+        """For every hand and object, the share (B,) of the dynamics model's attention that goes to it, mean over all
+        nodes; the shares sum to 1."""
+        return {
+            name: self.dynamics[:, :, columns].sum(-1).mean(-1) for name, columns in group_nodes(self.nodes).items()
+        }
 
 
 @dataclass
