@@ -61,12 +61,12 @@ def test_hdril_evaluates_with_both_commands(checkpoint: Path, tmp_path: Path) ->
     out = tmp_path / "ours"
     text = succeed(
         "hdril-eval", f"--policy.path={checkpoint}", "--num_episodes=2", "--seed=200000", "--rerun=1", "--workers=2",
-        f"--output_dir={out}", "--policy.replan_every=6",
+        f"--output_dir={out}", "--policy.rollout=open_loop",
     )  # fmt: skip
     results = json.loads((out / "results.json").read_text())
     assert results["n_success"] == 0
     assert results["held_out"] is True
-    assert results["overrides"] == ["--replan_every=6"]
+    assert results["overrides"] == ["--rollout=open_loop"]
     assert len(results["per_episode"]) == 2
     assert [path.name for path in (out / "rerun").iterdir()] == ["seed_0200000_failure.rrd"]
     assert "0 of 2 succeeded" in text
@@ -76,6 +76,12 @@ def test_hdril_evaluates_with_both_commands(checkpoint: Path, tmp_path: Path) ->
     done = call("hdril-eval", f"--policy.path={checkpoint}", "--seed=3", f"--output_dir={tmp_path / 'no'}")
     assert done.returncode == 2
     assert "were in the training data" in done.stderr
+    assert not (tmp_path / "no").exists()
+    done = call(
+        "hdril-eval", f"--policy.path={checkpoint}", "--policy.replan_every=6", f"--output_dir={tmp_path / 'no'}"
+    )
+    assert done.returncode == 2
+    assert "replan_every must be 0, because the checkpoint was trained with 0; got 6" in done.stderr
     assert not (tmp_path / "no").exists()
 
 
