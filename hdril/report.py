@@ -198,7 +198,7 @@ def _draw(path: Path, run: Run, outcomes: list[Outcome], summary: dict[str, Any]
         list(errors), [v["mean"] for v in errors.values()], yerr=[v["std"] for v in errors.values()], color="tab:blue"
     )
     bars.set(ylabel="cm from the expert's hands", title="Position error")
-    bars.tick_params(axis="x", rotation=30)
+    bars.set_xticks(range(len(errors)), list(errors), rotation=45, ha="right", rotation_mode="anchor")
     figure.suptitle(f"{run.task}: {headline(summary)}", fontsize=10)
     figure.savefig(path, dpi=110)
     plt.close(figure)

@@ -20,7 +20,8 @@ class BenchConfig:
     """Measure recording against the bare simulator, the loader against a training step, and one action."""
 
     task: str = "table_lift"
-    """Name of the task; an unknown one is answered with those there are."""
+    """Name of the task, with its parameters if it has any (peg_in_hole:clearance=0.004); an unknown one is answered with
+    those there are."""
     episodes: int = 12
     """Episodes that are recorded."""
     train_steps: int = 60

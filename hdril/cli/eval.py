@@ -39,7 +39,8 @@ class EvalConfig:
 
     policy: PolicySource
     task: str = "table_lift"
-    """Name of the task; an unknown one is answered with those there are."""
+    """Name of the task, with its parameters if it has any (peg_in_hole:clearance=0.004); an unknown one is answered with
+    those there are."""
     num_episodes: int = 100
     """Episodes, one a seed."""
     seed: int = 100_000

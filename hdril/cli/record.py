@@ -24,7 +24,8 @@ class RecordConfig:
     repo_id: str
     """Name of the dataset, as user/name."""
     task: str = "table_lift"
-    """Name of the task; an unknown one is answered with those there are."""
+    """Name of the task, with its parameters if it has any (peg_in_hole:clearance=0.004); an unknown one is answered with
+    those there are."""
     num_episodes: int = 100
     """Successful episodes to record."""
     seed: int = 0

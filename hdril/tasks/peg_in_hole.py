@@ -57,6 +57,8 @@ def _peg_half() -> tuple[Box, ...]:
 def _hole_half(clearance: float, chamfer: float) -> tuple[Box, ...]:
     """The right half: walls under its board leave a hole that is ``clearance`` wider than the peg on each side.
 
+    Above the peg the board itself is the ceiling, 5 mm away, whatever the clearance beyond that.
+
     With a chamfer the cheeks begin ``chamfer`` behind the face, and plates at 30 degrees lead the peg in between them.
     """
     face, depth = WIDTH / 2, PEG_LENGTH + 0.02
