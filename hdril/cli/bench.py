@@ -17,7 +17,8 @@ from hdril.world import World
 
 @dataclass
 class BenchConfig:
-    """Measure recording against the bare simulator, the loader against a training step, and one action."""
+    """Measure recording against the bare simulator, the loader against a training step, one action, training against
+    LeRobot's ACT, and HDR-IL's models called as one against one by one."""
 
     task: str = "table_lift"
     """Name of the task, with its parameters if it has any (peg_in_hole:clearance=0.004); an unknown one is answered with
@@ -119,6 +120,56 @@ def bench_action(root: Path, task: str) -> Figure:
     return Figure("one action, amortised over an episode", 1e3 * best / horizon, 2.0, False, "ms")
 
 
+def _samples_per_second(policy, batch: dict, steps: int) -> float:
+    """Frames that training steps (forward, backward, optimiser) take in a second, after one step to warm up."""
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    policy.train()
+
+    def step() -> None:
+        loss, _ = policy.forward(batch)
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+
+    step()
+    best = min(_seconds(step) for _ in range(steps))
+    return len(batch["index"]) / best
+
+
+def bench_policies(root: Path) -> list[Figure]:
+    """HDR-IL's training against ACT's, both at LeRobot's defaults, and its two ways of calling its models; one core."""
+    import torch
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from lerobot.policies.act.configuration_act import ACTConfig
+    from lerobot.policies.factory import make_policy
+    from lerobot_policy_hdril import HDRILConfig
+
+    torch.set_num_threads(1)
+    metadata = LeRobotDatasetMetadata("hdril/bench", root=root)
+    generator = torch.Generator().manual_seed(0)
+
+    def frames(count: int) -> dict[str, torch.Tensor]:
+        return {"index": torch.randint(metadata.total_frames, (count,), generator=generator)}
+
+    def hdril(how: str) -> float:
+        config = HDRILConfig(device="cpu", push_to_hub=False, experts=how)  # pyright: ignore
+        return _samples_per_second(make_policy(config, ds_meta=metadata), frames(64), 5)
+
+    separate, stacked = hdril("separate"), hdril("stacked")
+    act_config = ACTConfig(device="cpu", push_to_hub=False)
+    act = make_policy(act_config, ds_meta=metadata)
+    batch = frames(8)
+    for key, feature in act_config.input_features.items():
+        batch[key] = torch.randn(8, *feature.shape, generator=generator)
+    batch["action"] = torch.randn(8, act_config.chunk_size, *metadata.features["action"]["shape"], generator=generator)
+    batch["action_is_pad"] = torch.zeros(8, act_config.chunk_size, dtype=torch.bool)
+    theirs = _samples_per_second(act, batch, 3)
+    return [
+        Figure("training, samples per second against ACT's", separate / theirs, 30.0, True, "times"),
+        Figure("the models one by one against stacked", separate / stacked, 0.9, True, "times"),
+    ]
+
+
 def bench_command(config: BenchConfig) -> None:
     Recipe(config.task)
     with tempfile.TemporaryDirectory() as folder:
@@ -126,6 +177,8 @@ def bench_command(config: BenchConfig) -> None:
         print(bench_recording(config.task, config.episodes, root), flush=True)
         print(bench_training(config.task, root, config.train_steps, Path(folder) / "train"), flush=True)
         print(bench_action(root, config.task), flush=True)
+        for figure in bench_policies(root):
+            print(figure, flush=True)
 
 
 def main() -> None:

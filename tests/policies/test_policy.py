@@ -109,6 +109,28 @@ def test_attention_can_be_read_by_name_at_any_step(metadata) -> None:
         torch.testing.assert_close(torch.stack(list(received.values())).sum(0), torch.ones(2))
 
 
+@pytest.mark.parametrize("preset", ["hdril", "hdril_paper", "res_multi_relational"])
+def test_stacked_models_are_the_separate_ones(preset: str, metadata) -> None:
+    """Same predictions with several primitives in the batch, same loss gradients, at the start and within primitives."""
+    values = {"preset": preset, "replan_every": 4}
+    separate, stacked = (build(metadata, experts=how, **values) for how in ("separate", "stacked"))
+    with torch.no_grad():  # the head starts at zero where there are linear maps
+        for policy in (separate, stacked):
+            torch.manual_seed(1)
+            for parameter in policy.parameters():
+                parameter.add_(0.1 * torch.randn_like(parameter))
+    rows = torch.tensor([0, 3, 25, 15, 69, 70, 101, 140, 30, 31])
+    gradients = []
+    for policy in (separate.eval(), stacked.eval()):
+        window = policy._demonstrations.window(rows, 4, 12)  # pyright: ignore
+        predicted = policy._predict(window.state, window.primitive, window.elapsed)
+        policy._dynamics_loss(window)[0].backward()
+        gradients.append([*predicted, *(p.grad for p in policy.dynamics.parameters() if p.grad is not None)])
+    assert len(gradients[0]) == len(gradients[1]) > 10
+    for one, other in zip(*gradients, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
+
+
 def test_linear_maps_are_the_ridge_solution(metadata) -> None:
     """Without a penalty to speak of, they fit a linear relation exactly, from every frame at which a window starts."""
     policy = build(metadata, replan_every=5)
@@ -416,6 +438,8 @@ def test_loss_that_is_not_finite(metadata) -> None:
         ({"decoder": "rnn"}, "gru, ode"),
         ({"rollout": "sideways"}, "closed_loop, open_loop"),
         ({"hidden_dim": 0}, "at least 1"),
+        ({"experts": "piled"}, "auto, separate, stacked"),
+        ({"experts": "stacked", "decoder": "ode"}, "works with policy.decoder=gru"),
         ({"replan_every": -1}, "0 \\(never\\)"),
         ({"coordinates": "polar"}, "absolute, relational"),
         ({"latent": "quantum"}, "deterministic, variational"),

@@ -7,6 +7,22 @@ from torch import Tensor, nn
 from torchdiffeq import odeint
 
 
+def gru_step(gates: Tensor, hidden: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """One step of PyTorch's GRU, written out, because vmap has no rule for it.
+
+    Args:
+        gates: the input's share of reset, update and new gate (B, 3 H).
+        hidden: (B, H).
+        weight: weight_hh (3 H, H).
+        bias: bias_hh (3 H,).
+    """
+    reset, update, new = gates.chunk(3, dim=-1)
+    hidden_reset, hidden_update, hidden_new = nn.functional.linear(hidden, weight, bias).chunk(3, dim=-1)
+    update = (update + hidden_update).sigmoid()
+    new = (new + (reset + hidden_reset).sigmoid() * hidden_new).tanh()
+    return new + update * (hidden - new)
+
+
 class GRUDecoder(nn.Module):
     """A GRU whose first hidden state is the latent; its input at each step is the number of that step, embedded.
 
@@ -19,8 +35,15 @@ class GRUDecoder(nn.Module):
         self.step = nn.Embedding(steps, hidden_dim // 4)
         self.gru = nn.GRU(hidden_dim // 4, hidden_dim, batch_first=True)
 
-    def forward(self, latent: Tensor, steps: Tensor) -> Tensor:
-        """Latent (B, H) and step numbers (B, M) to hidden states (B, M, H)."""
+    def forward(self, latent: Tensor, steps: Tensor, stacked: bool = False) -> Tensor:
+        """Latent (B, H) and step numbers (B, M) to hidden states (B, M, H); ``stacked`` under vmap."""
+        if stacked:
+            gru, hidden, path = self.gru, latent, []
+            gates = nn.functional.linear(self.step(steps), gru.weight_ih_l0, gru.bias_ih_l0)
+            for gate in gates.unbind(1):
+                hidden = gru_step(gate, hidden, gru.weight_hh_l0, gru.bias_hh_l0)
+                path.append(hidden)
+            return torch.stack(path, dim=1)
         hidden, _ = self.gru(self.step(steps), latent[None].contiguous())
         return hidden
 
@@ -33,7 +56,7 @@ class ODEDecoder(nn.Module):
         self.gradient = nn.Sequential(nn.Linear(hidden_dim, hidden_dim), nn.Tanh(), nn.Linear(hidden_dim, hidden_dim))
         self.steps = steps
 
-    def forward(self, latent: Tensor, steps: Tensor) -> Tensor:
+    def forward(self, latent: Tensor, steps: Tensor, stacked: bool = False) -> Tensor:
         """Latent (B, H) and step numbers (B, M) to hidden states (B, M, H)."""
         times = torch.arange(steps.shape[1] + 1, dtype=latent.dtype, device=latent.device) / self.steps
         path = odeint(lambda _, h: self.gradient(h), latent, times, method="rk4")

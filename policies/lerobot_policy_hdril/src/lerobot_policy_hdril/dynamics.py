@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 
-from lerobot_policy_hdril.decoders import DECODERS
+from lerobot_policy_hdril.decoders import DECODERS, gru_step
 from lerobot_policy_hdril.interaction import make_interaction
 
 
@@ -112,17 +115,24 @@ class PrimitiveDynamics(nn.Module):
     skip_columns: Tensor
 
     def forward(
-        self, normalised: Tensor, raw: Tensor, context: Tensor, steps: Tensor, samples: int = 0
+        self, normalised: Tensor, raw: Tensor, context: Tensor, steps: Tensor, samples: int = 0, stacked: bool = False
     ) -> tuple[Tensor, Tensor]:
         """States (B, S), context (B, C) and step numbers (B, M) to a prediction, and how far the latent is from its prior.
 
         Args:
             samples: latents to draw and average over; 0 takes the mean latent. In training, one is drawn.
+            stacked: called by :func:`predict_stacked` under vmap; leaves out the linear maps.
 
         Returns:
             Normalised actions and states (B, M, A + S), and KL(N(m, e^v) || N(0, 1)) (B,) in nats, 0 if deterministic.
         """
-        hidden = self.encoder(self.graph(normalised, raw))
+        seen = self.graph(normalised, raw)
+        if stacked:
+            encoder, start = self.encoder, seen.new_zeros(len(seen), self.encoder.hidden_size)
+            gates = nn.functional.linear(seen, encoder.weight_ih, encoder.bias_ih)
+            hidden = gru_step(gates, start, encoder.weight_hh, encoder.bias_hh)
+        else:
+            hidden = self.encoder(seen)
         latent = self.latent(torch.cat([hidden, normalised[:, self.skip_columns], context], dim=-1))
         divergence = latent.new_zeros(len(latent))
         if self.variational:
@@ -131,10 +141,10 @@ class PrimitiveDynamics(nn.Module):
             noise = self._noise(mean, samples)
             latent = (mean + (0.5 * log_variance).exp() * noise).flatten(0, 1)
         copies = len(latent) // max(len(normalised), 1)
-        decoded = self.decoder(latent, steps.repeat(copies, 1))
+        decoded = self.decoder(latent, steps.repeat(copies, 1), stacked)
         output = self.head(torch.cat([decoded, latent[:, None].expand_as(decoded)], dim=-1))
         output = output.unflatten(0, (copies, len(normalised))).mean(0)
-        if self.state_skip is not None:
+        if not stacked and self.state_skip is not None:
             output = output + self.state_skip(normalised, steps)
         return output, divergence
 
@@ -147,3 +157,48 @@ class PrimitiveDynamics(nn.Module):
             return mean.new_zeros(1, 1, 1)
         generator = torch.Generator().manual_seed(0)
         return torch.randn(samples, 1, mean.shape[-1], generator=generator).to(mean)
+
+
+def predict_stacked(
+    models: Sequence[PrimitiveDynamics],
+    normalised: Tensor,
+    raw: Tensor,
+    context: Tensor,
+    steps: Tensor,
+    which: Tensor,
+    samples: int = 0,
+) -> tuple[Tensor, Tensor]:
+    """What each model's :meth:`~PrimitiveDynamics.forward` gives for its rows, all models in one batched call.
+
+    The weights are stacked anew in each call, so that optimisers and checkpoints see the modules alone. Rows are padded to
+    those of the busiest model. The linear maps are no part of it: their step numbers differ from row to row.
+
+    Args:
+        which: the model of each row (B,); the rest as in ``forward``.
+    """
+    present, group, counts = which.unique(return_inverse=True, return_counts=True)
+    used = [models[k] for k in present.tolist()]
+    order = group.argsort(stable=True)
+    place = torch.arange(len(which), device=which.device) - (counts.cumsum(0) - counts)[group[order]]
+    slot = torch.empty_like(place).index_copy(0, order, place)
+    rows = torch.zeros(len(used), int(counts.max()), dtype=torch.long, device=which.device)
+    rows[group, slot] = torch.arange(len(which), device=which.device)
+    named = [dict(model.named_parameters()) for model in used]
+    stacked = {name: torch.stack([parameters[name] for parameters in named]) for name in named[0]}
+    # Buffers other than the linear maps, which are not called, are the same in all models.
+    buffers = dict(used[0].named_buffers())
+
+    def one(parameters: dict[str, Tensor], *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        return functional_call(used[0], (parameters, buffers), inputs, {"samples": samples, "stacked": True})
+
+    # "same": sampled latents outside of training are those of a model called alone.
+    batched = torch.vmap(one, randomness="same")
+    output, divergence = batched(stacked, normalised[rows], raw[rows], context[rows], steps[rows])
+    output, divergence = output[group, slot], divergence[group, slot]
+    if used[0].state_skip is None:
+        return output, divergence
+    linear = torch.empty_like(output)
+    for k, model in zip(present.tolist(), used, strict=True):
+        mine = (which == k).nonzero().squeeze(-1)
+        linear = linear.index_copy(0, mine, model.state_skip(normalised[mine], steps[mine]))  # pyright: ignore
+    return output + linear, divergence

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from lerobot_policy_hdril.configuration_hdril import HDRILConfig
 from lerobot_policy_hdril.coordinates import RelationalCoordinates
 from lerobot_policy_hdril.demonstrations import Demonstrations, History, Window
-from lerobot_policy_hdril.dynamics import PrimitiveDynamics
+from lerobot_policy_hdril.dynamics import PrimitiveDynamics, predict_stacked
 from lerobot_policy_hdril.graph import group_nodes, quaternion_groups
 from lerobot_policy_hdril.planner import Planner
 
@@ -274,6 +274,9 @@ class HDRILPolicy(PreTrainedPolicy):
         if not self.config.per_primitive:
             context = F.one_hot(primitive, len(self.config.primitives)).to(state.dtype)
             return self.dynamics[0](normalised, state, context, steps, samples)
+        if self._stacks(primitive):
+            context = state.new_zeros(len(state), 0)
+            return predict_stacked(self.dynamics, normalised, state, context, steps, primitive, samples)  # pyright: ignore
         result = torch.empty(len(state), self.longest, len(self.loss_weights), device=state.device, dtype=state.dtype)
         divergence = state.new_zeros(len(state))
         for k in primitive.unique().tolist():
@@ -282,6 +285,15 @@ class HDRILPolicy(PreTrainedPolicy):
             part, far = self.dynamics[k](normalised[mine], state[mine], context, steps[mine], samples)
             result, divergence = result.index_copy(0, mine, part), divergence.index_copy(0, mine, far)
         return result, divergence
+
+    def _stacks(self, primitive: Tensor) -> bool:
+        """Whether to call the models of a batch as one. On a CPU the products are as long either way and padding costs;
+        elsewhere many small calls cost more."""
+        if self.config.experts == "auto":
+            if self.config.decoder == "ode" or primitive.device.type == "cpu":
+                return False
+            return bool((primitive != primitive[0]).any())
+        return self.config.experts == "stacked"
 
     # ------------------------------------------------------------------ rollout
 
