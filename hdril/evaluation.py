@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -15,62 +15,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hdril.conditions import ROBOT
 from hdril.control import ACTION_NAMES
 from hdril.demonstrator import Demonstrator, Observation
 from hdril.env import BimanualEnv
 from hdril.files import cache_folder, write_atomically
-from hdril.metrics import trajectory_error
+from hdril.metrics import hand_poses, trajectory_error
 from hdril.primitives import Noise
 from hdril.recording import Provenance, read_provenance
-from hdril.robots.spec import SIDES
 from hdril.tasks import Task, base_name
+from hdril.trace import Belief, Move, Trace, demonstrate_trace, run_episode
 
-
-@dataclass(frozen=True)
-class Belief:
-    """What a policy with primitives thinks at a frame, in the task's labels."""
-
-    primitive: int
-    """Label of what it plays."""
-    probabilities: NDArray[np.float32]
-    """(K,), the planner's."""
-    plan: NDArray[np.float32] | None
-    """(M, 16), the actions from here to the end of the primitive, if it has just planned anew."""
-    attention: dict[str, float]
-    """Share of the playing model's attention that each hand and object receives."""
-
-
-@dataclass(frozen=True)
-class Move:
-    """What a policy answers to an observation."""
-
-    action: NDArray[np.float32]  # (16,)
-    belief: Belief | None = None
-
-
-@dataclass(frozen=True)
-class Trace:
-    """Everything that a viewer wants of one episode of T frames. States have T + 1 rows: the last is after the end."""
-
-    state: NDArray[np.float32]  # (T + 1, 16)
-    environment_state: NDArray[np.float32]  # (T + 1, 7 per object)
-    action: NDArray[np.float32]  # (T, 16)
-    joints: NDArray[np.float64]  # (T + 1, joints of the robot)
-    reward: NDArray[np.float32]  # (T,)
-    scripted: NDArray[np.int64]  # (T,), label of the expert; -1 past its end
-    beliefs: tuple[Belief | None, ...]  # (T,)
-    ik_failures: tuple[str, ...]  # (T,), empty strings where there was none
-    stage: NDArray[np.int64]  # (T + 1,), how many of the task's stages were reached, success being the last
-    measures: NDArray[np.float64]  # (T + 1, measures of the task)
-    ik_error: NDArray[np.float64]  # (T, 2), m: how far inverse kinematics stayed from the commands, left and right
-    grip_force: NDArray[np.float64]  # (T + 1, 2), N: what the pads of each hand press on objects with
-    contacts: dict[str, NDArray[np.bool_]]  # (T + 1,) by "first, second": whether they touch
-
-    @property
-    def predicted(self) -> NDArray[np.int64]:
-        """(T,), label of the primitive that the policy plays; -1 if it has none."""
-        return np.array([-1 if belief is None else belief.primitive for belief in self.beliefs])
+DEPARTURE = 0.02
+"""m from the expert's path at which an episode counts as having left it: successes stay within a few millimetres."""
 
 
 @dataclass(frozen=True)
@@ -98,18 +54,23 @@ class Outcome:
     """Frames of the expert's primitive (row) at which the planner preferred each (column); empty without a planner."""
     planner_boundary_hits: list[bool] = field(default_factory=list)
     """For each primitive of the expert, whether the planner preferred it at its first frame."""
+    departed_frame: int = -1
+    """First frame at whose end a hand or an object is more than :data:`DEPARTURE` from where the expert has it; -1: none."""
+    departed_in: str = ""
+    """The primitive that was played then (the expert's, if the policy has none)."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """What an episode is compared with: the noise-free expert's states (T + 1, 16) and labels (T,) on the same seed."""
+    """What an episode is compared with: the noise-free expert's episode on the same seed."""
 
-    state: NDArray[np.float32]
-    scripted: NDArray[np.int64]
+    state: NDArray[np.float32]  # (T + 1, 16)
+    environment_state: NDArray[np.float32]  # (T + 1, 7 per object)
+    scripted: NDArray[np.int64]  # (T,), labels
 
-
-Act = Callable[[Observation], Move]
-"""A policy as the evaluation sees it."""
+    @staticmethod
+    def of(trace: Trace) -> Reference:
+        return Reference(trace.state, trace.environment_state, trace.scripted)
 
 
 class LeRobotActor:
@@ -174,80 +135,6 @@ class LeRobotActor:
         return Belief(int(self._labels[int(rollout.primitive[0])]), probabilities, plan, attention)
 
 
-def _contacts(env: BimanualEnv) -> tuple[NDArray[np.float64], dict[str, bool]]:
-    """Pressure (2,), N, of the pads of each hand on objects, and which bodies touch, for those that move."""
-    world, task = env.world, env.task_spec
-    force, touching = np.zeros(len(SIDES)), {}
-    for i, name in enumerate(task.observed):
-        held = world.contacts(ROBOT, name)
-        touching[f"{ROBOT}, {name}"] = bool(held)
-        for side, arm in enumerate(env.robot_spec.arms.values()):
-            force[side] += sum(contact.force for contact in held if contact.link_a in arm.gripper.pads)
-        others = [body.name for body in task.bodies if body.name not in task.observed[: i + 1]]
-        touching |= {f"{name}, {other}": bool(world.contacts(name, other)) for other in others}
-    return force, touching
-
-
-def run_episode(env: BimanualEnv, act: Act, seed: int, labels: NDArray[np.int64]) -> tuple[Trace, bool, str]:
-    """Play the scene of ``seed``; ``labels`` are the expert's."""
-    observation, info = env.reset(seed=seed)
-    names = [measure.name for measure in env.task_spec.measures]
-    joints = env.world.joint_indices(ROBOT, env.controller.joint_names)
-    observations, positions = [observation], [env.world.joint_positions(ROBOT, joints)]
-    actions, rewards, beliefs, failures = [], [], [], []
-    progress = [[info[key] for key in ("stage", *names)]]
-    touches, ik_errors = [_contacts(env)], []
-    done = False
-    while not done:
-        move = act(observation)
-        observation, reward, terminated, truncated, info = env.step(move.action)
-        done = terminated or truncated
-        observations.append(observation)
-        positions.append(env.world.joint_positions(ROBOT, joints))
-        actions.append(move.action)
-        rewards.append(reward)
-        beliefs.append(move.belief)
-        failures.append(info["ik_failure"])
-        progress.append([info[key] for key in ("stage", *names)])
-        touches.append(_contacts(env))
-        ik_errors.append([env.controller.results[side].position_error for side in SIDES])
-    scripted = np.full(len(actions), -1)
-    scripted[: len(labels)] = labels[: len(actions)]
-    trace = Trace(
-        state=np.stack([o["agent_pos"] for o in observations]),
-        environment_state=np.stack([o["environment_state"] for o in observations]),
-        action=np.stack(actions).astype(np.float32),
-        joints=np.stack(positions),
-        reward=np.array(rewards, np.float32),
-        scripted=scripted,
-        beliefs=tuple(beliefs),
-        ik_failures=tuple(failures),
-        stage=np.array([row[0] for row in progress]),
-        measures=np.array([row[1:] for row in progress], dtype=np.float64),
-        ik_error=np.array(ik_errors),
-        grip_force=np.stack([force for force, _ in touches]),
-        contacts={pair: np.array([touching[pair] for _, touching in touches]) for pair in touches[0][1]},
-    )
-    return trace, bool(info["is_success"]), str(info["unmet"])
-
-
-def demonstrate_trace(env: BimanualEnv, expert: Demonstrator, seed: int) -> Trace:
-    """The expert's episode of this seed, as a trace."""
-    expert.reset(seed)
-    labels = np.repeat(
-        [env.task_spec.labels.index(p.name) for p in env.task_spec.primitives],
-        [p.frames for p in env.task_spec.primitives],
-    )
-
-    certain = np.eye(len(env.task_spec.labels), dtype=np.float32)
-
-    def act(observation: Observation) -> Move:
-        step = expert.act(observation)
-        return Move(step.action.astype(np.float32), Belief(step.label, certain[step.label], None, {}))
-
-    return run_episode(env, act, seed, labels)[0]
-
-
 class ReferenceCache:
     """The expert's episodes on disk, by seed: several policies on the same seeds need each of them once.
 
@@ -267,10 +154,10 @@ class ReferenceCache:
         path = self._folder / f"{seed}.npz"
         if path.exists():
             with np.load(path) as data:
-                return Reference(data["state"], data["scripted"])
-        trace = demonstrate_trace(self._env, self._expert, seed)
-        write_atomically(path, lambda file: np.savez(file, state=trace.state, scripted=trace.scripted))
-        return Reference(trace.state, trace.scripted)
+                return Reference(**data)
+        reference = Reference.of(demonstrate_trace(self._env, self._expert, seed))
+        write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **vars(reference)))
+        return reference
 
 
 def judge(task: Task, seed: int, trace: Trace, reference: Reference, success: bool, unmet: str) -> Outcome:
@@ -284,10 +171,13 @@ def judge(task: Task, seed: int, trace: Trace, reference: Reference, success: bo
         for k, name in enumerate(names)
         if (labels == k).any()
     }
-    changes = np.flatnonzero(np.diff(trace.predicted, prepend=-2))
-    played = tuple(str(names[trace.predicted[i]]) for i in changes if 0 <= trace.predicted[i] < len(names))
+    executed = trace.executed
+    changes = np.flatnonzero(np.diff(executed, prepend=-2))
+    played = tuple(str(names[executed[i]]) for i in changes if 0 <= executed[i] < len(names))
     start = trace.environment_state[0].reshape(-1, 7)[:, :2]
     confusion, hits = _planner_scores(trace, len(names))
+    departed = _departure(trace, reference)
+    doing = -1 if departed < 0 else executed[departed] if executed[departed] >= 0 else trace.scripted[departed]
     return Outcome(
         seed=seed,
         success=success,
@@ -303,20 +193,48 @@ def judge(task: Task, seed: int, trace: Trace, reference: Reference, success: bo
         stage=("", *(stage.name for stage in task.stages), "success")[trace.stage[-1]],
         planner_confusion=confusion,
         planner_boundary_hits=hits,
+        departed_frame=departed,
+        departed_in=str(names[doing]) if doing >= 0 else "",
         measures={m.name: round(float(v), 5) for m, v in zip(task.measures, trace.measures[-1], strict=True)},
     )
+
+
+def _departure(trace: Trace, reference: Reference) -> int:
+    """The frame whose end is the first with a hand or an object too far from the expert's; -1 if there is none."""
+
+    def positions(episode: Trace | Reference) -> NDArray[np.float64]:
+        objects = episode.environment_state.reshape(len(episode.state), -1, 7)
+        return np.concatenate([hand_poses(episode.state), objects], axis=1)[..., :3]
+
+    ours, theirs = positions(trace), positions(reference)
+    frames = min(len(ours), len(theirs))
+    away = np.linalg.norm(ours[:frames] - theirs[:frames], axis=-1).max(1) > DEPARTURE
+    return max(int(away.argmax()) - 1, 0) if away.any() else -1
 
 
 def _planner_scores(trace: Trace, count: int) -> tuple[list[list[int]], list[bool]]:
     """Confusion matrix (K, K) over frames, and hits at the first frames of the expert's primitives."""
     if any(belief is None for belief in trace.beliefs):
         return [], []
-    preferred = np.array([belief.probabilities.argmax() for belief in trace.beliefs if belief is not None])
+    preferred = trace.predicted
     confusion = np.zeros((count, count), np.int64)
     scripted = trace.scripted
     np.add.at(confusion, (scripted[scripted >= 0], preferred[scripted >= 0]), 1)
     first = np.flatnonzero(np.diff(scripted, prepend=-1))
     return confusion.tolist(), [bool(preferred[i] == scripted[i]) for i in first if scripted[i] >= 0]
+
+
+def check_keep(option: str, keep: str) -> None:
+    """Raises ValueError unless ``keep`` says which episodes to keep as recordings; ``option`` is what a user typed."""
+    if keep not in ("failures", "all", "none") and not keep.isdigit():
+        raise ValueError(f"{option} must be failures, all, none or a number, got {keep!r}")
+
+
+def keeps(keep: str, number: int, success: bool) -> bool:
+    """Whether to keep the episode of this number, counted from 0."""
+    if keep.isdigit():
+        return number < int(keep)
+    return keep == "all" or (keep == "failures" and not success)
 
 
 @dataclass(frozen=True)
@@ -352,19 +270,12 @@ class Worker:
         self._actor.reset(seed)
         trace, success, unmet = run_episode(self.env, self._actor.act, seed, reference.scripted)
         outcome = judge(task, seed, trace, reference, success, unmet)
-        if self._keeps(outcome):
+        number = seed - self.job.first_seed
+        if self.job.recordings is not None and keeps(self.job.keep, number, success):
             from hdril.rerun_log import write_recording
 
-            write_recording(self.job.recordings, self.env, outcome, trace, reference)  # pyright: ignore
+            write_recording(self.job.recordings, self.env, outcome, trace, reference)
         return outcome
-
-    def _keeps(self, outcome: Outcome) -> bool:
-        keep = self.job.keep
-        if self.job.recordings is None or keep == "none":
-            return False
-        if keep in ("all", "failures"):
-            return keep == "all" or not outcome.success
-        return outcome.seed < self.job.first_seed + int(keep)
 
 
 _workers: dict[Job, Worker] = {}

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from hdril.control import ACTION_NAMES
 from hdril.env import BimanualEnv
+from hdril.evaluation import ReferenceCache, check_keep, judge, keeps
 from hdril.tasks import TASKS, get_task
+from hdril.trace import Move, TraceRecorder
 
 for _task in TASKS.values():
     gym.register(id=_task.gym_id, entry_point="hdril.env:BimanualEnv", kwargs={"task": _task.name})
@@ -31,6 +36,11 @@ class HDRILEnvConfig(EnvConfig):
     """Frames before an episode is cut; the task's horizon unless given."""
     meshes: bool = False
     """Draw the robot's meshes in videos instead of simple shapes: ten times as slow."""
+    rerun: str = "none"
+    """Episodes to keep as Rerun recordings: failures, all, none, or a number of episodes from an environment's first on.
+    hdril-eval also records what the policy planned and believed, which an environment does not see."""
+    rerun_dir: str = "outputs/rerun"
+    """Folder of the recordings, a file each."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(
         default_factory=lambda: {ACTION: ACTION, "agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
@@ -60,14 +70,20 @@ class HDRILEnvConfig(EnvConfig):
             "meshes": self.meshes,
         }
 
+    @property
+    def recordings(self) -> dict[str, str]:
+        """What :func:`make_env` wants to know of Rerun recordings."""
+        return {"keep": self.rerun, "folder": self.rerun_dir}
+
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """One vector environment, as LeRobot wants it. Raises ValueError if the task is unknown.
+        """One vector environment, as LeRobot wants it. Raises ValueError if the task or ``rerun`` is not a valid one.
 
         Workers of an asynchronous one get a factory of this module, so that they import it: a gym id alone would not
         be known to them.
         """
         get_task(self.task or "")
-        factories = [partial(make_env, self.task, **self.gym_kwargs)] * n_envs
+        check_keep("env.rerun", self.rerun)
+        factories = [partial(make_env, self.task, self.recordings, **self.gym_kwargs)] * n_envs
         same_step = gym.vector.AutoresetMode.SAME_STEP
         if use_async_envs and n_envs > 1:
             vector = gym.vector.AsyncVectorEnv(factories, context="forkserver", autoreset_mode=same_step)
@@ -76,8 +92,55 @@ class HDRILEnvConfig(EnvConfig):
         return {self.type: {0: vector}}
 
 
-def make_env(task: str, **kwargs) -> gym.Env:
-    """An environment that stops simulating once its episode is over."""
+def make_env(task: str, recordings: dict[str, str], **kwargs) -> gym.Env:
+    """An environment that stops simulating once its episode is over, and writes Rerun recordings if it is told to."""
     from lerobot.envs.utils import FreezeAfterEpisodeEnd
 
-    return FreezeAfterEpisodeEnd(BimanualEnv(task, **kwargs))
+    env: gym.Env = BimanualEnv(task, **kwargs)
+    if recordings["keep"] != "none":
+        env = RecordedEpisodes(env, recordings["keep"], Path(recordings["folder"]))  # pyright: ignore
+    return FreezeAfterEpisodeEnd(env)
+
+
+class RecordedEpisodes(gym.Wrapper):
+    """Writes episodes as Rerun recordings, judged like those of ``hdril-eval``.
+
+    Only episodes whose ``reset`` was given a seed: the expert's episode of the same seed is part of a recording.
+    """
+
+    env: BimanualEnv
+
+    def __init__(self, env: BimanualEnv, keep: str, folder: Path) -> None:
+        super().__init__(env)
+        self._keep, self._folder = keep, folder
+        self._references = ReferenceCache(BimanualEnv(env.task))
+        self._recorder: TraceRecorder | None = None
+        self._seed, self._episode = -1, -1
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._recorder = None
+        if seed is not None:
+            self._recorder = TraceRecorder(self.env, observation, info)
+            self._seed, self._episode = seed, self._episode + 1
+        return observation, info
+
+    def step(self, action):
+        result = self.env.step(action)
+        if self._recorder is not None:
+            observation, reward, terminated, truncated, info = result
+            self._recorder.add(Move(np.array(action, np.float32)), observation, float(reward), info)
+            if terminated or truncated:
+                self._finish(bool(info["is_success"]), str(info["unmet"]))
+        return result
+
+    def _finish(self, success: bool, unmet: str) -> None:
+        recorder, self._recorder = self._recorder, None
+        if recorder is None or not keeps(self._keep, self._episode, success):
+            return
+        from hdril.rerun_log import write_recording
+
+        reference = self._references.get(self._seed)
+        trace = recorder.finish(reference.scripted)
+        outcome = judge(self.env.task_spec, self._seed, trace, reference, success, unmet)
+        write_recording(self._folder, self.env, outcome, trace, reference)

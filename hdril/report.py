@@ -15,7 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from hdril import __version__
-from hdril.evaluation import Outcome
+from hdril.evaluation import DEPARTURE, Outcome
 from hdril.statistics import wilson_interval
 from hdril.tasks import get_task
 
@@ -168,11 +168,33 @@ def _markdown(run: Run, outcomes: list[Outcome], summary: dict[str, Any]) -> str
             counts = ", ".join(f"{name} ({reached[name]})" for name in order if reached[name])
             lines += [f"How far they came: {counts}.", ""]
         measures = [measure.name for measure in get_task(run.task).measures]
-        heads = ["seed", "not met", "last stage", *measures, "position error, cm", "frames without inverse kinematics"]
+        if left := Counter(outcome.departed_in for outcome in failures if outcome.departed_in):
+            lines += [
+                f"Where a hand or an object was first more than {100 * DEPARTURE:.0f} cm from the expert's: "
+                + ", ".join(f"{name} ({n})" for name, n in left.most_common()) + ".",
+                "",
+            ]  # fmt: skip
+        heads = [
+            "seed",
+            "not met",
+            "last stage",
+            "left the expert's path in",
+            *measures,
+            "position error, cm",
+            "frames without inverse kinematics",
+        ]
         lines += ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
         for o in failures:
             values = [f"{o.measures[name]:.4g}" for name in measures]
-            row = [str(o.seed), o.unmet, o.stage or "none", *values, f"{o.position_error_cm:.2f}", str(o.ik_failures)]
+            row = [
+                str(o.seed),
+                o.unmet,
+                o.stage or "none",
+                o.departed_in,
+                *values,
+                f"{o.position_error_cm:.2f}",
+                str(o.ik_failures),
+            ]
             lines.append("| " + " | ".join(row) + " |")
         lines += [""]
     return "\n".join(lines)

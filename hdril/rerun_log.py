@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,21 +13,31 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from hdril.env import BimanualEnv
-from hdril.geometry import Pose
 from hdril.metrics import hand_poses
 from hdril.robots.spec import SIDES
 
 if TYPE_CHECKING:
-    from hdril.evaluation import Outcome, Reference, Trace
+    from hdril.evaluation import Outcome, Reference
+    from hdril.trace import Trace
 
+APPLICATION = "hdril"
 TIMELINE = "time"
-WORLD_FRAME = "tf#/world"  # the frame that Rerun gives the entity "world"; the robot's own frames hang below it
 COLOURS = {
     "executed": ((40, 110, 220), (220, 90, 30)),
     "commanded": ((150, 190, 250), (250, 190, 150)),
     "expert": ((120, 200, 120), (120, 200, 120)),
     "plan": ((150, 60, 220), (220, 60, 180)),
 }
+LANES = ("scripted", "predicted", "executed")  # attributes of a Trace
+
+
+@dataclass(frozen=True)
+class Played:
+    """An episode to show: what happened, how it was judged, and who played it ("" if there is but one)."""
+
+    outcome: Outcome
+    trace: Trace
+    player: str = ""
 
 
 def recording_name(outcome: Outcome) -> str:
@@ -35,233 +47,273 @@ def recording_name(outcome: Outcome) -> str:
 
 def write_recording(folder: Path, env: BimanualEnv, outcome: Outcome, trace: Trace, reference: Reference) -> Path:
     """Write ``<folder>/<recording_name>.rrd``. Times are seconds from the start of the episode."""
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{recording_name(outcome)}.rrd"
-    with rr.RecordingStream("hdril", recording_id=f"{env.task}-{recording_name(outcome)}") as stream:
-        stream.save(path, default_blueprint=_blueprint(env))
-        stream.send_recording_name(recording_name(outcome))
-        times = np.arange(len(trace.state)) * env.world.physics.control_period
-        _log_scene(stream, env)
-        _log_robot(stream, env, trace, times)
-        for name, poses in zip(
-            env.task_spec.observed, trace.environment_state.reshape(len(times), -1, 7).swapaxes(0, 1), strict=True
-        ):
-            _send_poses(stream, f"world/{name}", poses, times)
-        _log_hands(stream, "executed", trace.state, times)
-        _log_hands(stream, "commanded", trace.action, times[:-1])
-        _log_hands(
-            stream, "expert", reference.state, np.arange(len(reference.state)) * env.world.physics.control_period
-        )
-        _log_primitives(stream, env, trace, times)
-        _log_beliefs(stream, env, trace, times)
-        _log_scalars(stream, env, outcome, trace, times)
+    name = recording_name(outcome)
+    return write_episodes(folder / f"{name}.rrd", name, env, [Played(outcome, trace)], reference)
+
+
+def write_episodes(path: Path, name: str, env: BimanualEnv, episodes: list[Played], reference: Reference) -> Path:
+    """Write one recording of several players' episodes of the same seed, side by side on one timeline.
+
+    Entities of a player begin with its name. ``env`` holds the scene of that seed.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with rr.RecordingStream(APPLICATION, recording_id=f"{env.task}-{name}") as stream:
+        stream.save(path, default_blueprint=_blueprint(env, [episode.player for episode in episodes]))
+        stream.send_recording_name(name)
+        for episode in episodes:
+            _EpisodeLog(stream, env, episode, reference).send()
     return path
+
+
+@lru_cache(maxsize=4)
+def _robot_tree(path: str, root: str) -> rr.urdf.UrdfTree:
+    """Once a process: reading the URDF takes as long as all the curves of an episode."""
+    return rr.urdf.UrdfTree.from_file_path(path, entity_path_prefix=f"{root}robot", frame_prefix=root or None)
+
+
+class _EpisodeLog:
+    """One player's entities."""
+
+    def __init__(self, stream: rr.RecordingStream, env: BimanualEnv, episode: Played, reference: Reference) -> None:
+        self._stream, self._env, self._reference = stream, env, reference
+        self._outcome, self._trace = episode.outcome, episode.trace
+        self._root = f"{episode.player}/" if episode.player else ""
+        self._period = env.world.physics.control_period
+        self._times = np.arange(len(self._trace.state)) * self._period
+
+    def send(self) -> None:
+        trace, times = self._trace, self._times
+        self._scene()
+        self._robot()
+        objects = trace.environment_state.reshape(len(times), -1, 7).swapaxes(0, 1)
+        for name, poses in zip(self._env.task_spec.observed, objects, strict=True):
+            columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, 3:])
+            self._stream.send_columns(f"{self._root}world/{name}", _columns(times), columns)
+        expert = self._reference.state
+        log_hands(self._stream, "executed", trace.state, times, self._root)
+        log_hands(self._stream, "commanded", trace.action, times[:-1], self._root)
+        log_hands(self._stream, "expert", expert, np.arange(len(expert)) * self._period, self._root)
+        for lane in LANES:
+            labels, names = getattr(trace, lane), self._env.task_spec.labels
+            log_lane(self._stream, f"{self._root}primitive/{lane}", labels, names, times)
+        self._beliefs()
+        self._scalars()
+        self._verdict()
+
+    def _log(self, entity: str, component, static: bool = False) -> None:
+        self._stream.log(self._root + entity, component, static=static)
+
+    def _log_at(self, frame: int, entity: str, component) -> None:
+        self._stream.set_time(TIMELINE, duration=float(self._times[frame]))
+        self._log(entity, component)
+
+    def _curve(self, entity: str, values: NDArray[np.floating], at: NDArray[np.floating]) -> None:
+        columns = rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64))
+        self._stream.send_columns(self._root + entity, _columns(at), columns)
+
+    def _scene(self) -> None:
+        self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for body in self._env.task_spec.bodies:
+            shape = rr.Boxes3D(
+                sizes=[box.size for box in body.boxes],
+                centers=[box.centre for box in body.boxes],
+                quaternions=[box.quaternion for box in body.boxes],
+                colors=[[round(255 * c) for c in box.colour] for box in body.boxes],
+                fill_mode="solid",
+            )
+            self._log(f"world/{body.name}/shape", shape, static=True)
+            if body.name not in self._env.task_spec.observed:
+                pose = self._env.world.pose(body.name)
+                place = rr.Transform3D(translation=pose.position, quaternion=pose.quaternion.tolist())
+                self._log(f"world/{body.name}", place, static=True)
+
+    def _robot(self) -> None:
+        """The robot as the simulation has it, shapes that collide and no meshes: 16 MB less in every file."""
+        spec = self._env.robot_spec
+        tree = _robot_tree(str(spec.urdf(False)), self._root)
+        tree.log_urdf_to_recording(self._stream)
+        place = rr.Transform3D(
+            translation=spec.base.position,
+            quaternion=spec.base.quaternion.tolist(),
+            # The frame that Rerun gives the entity "world"; the robot's own frames hang below it.
+            parent_frame=f"tf#/{self._root}world",
+            child_frame=f"{self._root}{tree.root_link().name}",
+        )
+        self._log("robot/base_in_world", place, static=True)
+        for column, name in enumerate(self._env.controller.joint_names):
+            joint = tree.get_joint_by_name(name)
+            if joint is None:
+                raise ValueError(f"{spec.name}'s URDF has no joint {name!r}")
+            # A finger that is pressed leaves its limits by a hair: clamping would print a warning for every frame.
+            columns = joint.compute_transform_columns(self._trace.joints[:, column].tolist(), clamp=False)
+            self._stream.send_columns(f"{self._root}robot/joints/{name}", _columns(self._times), columns)
+
+    def _beliefs(self) -> None:
+        """The planner's probabilities, who receives the model's attention, and each plan as a trail that fades to its end."""
+        beliefs = {i: belief for i, belief in enumerate(self._trace.beliefs) if belief is not None}
+        if not beliefs:
+            return
+        at = self._times[list(beliefs)]
+        for label, name in enumerate(self._env.task_spec.labels):
+            self._curve(f"planner/{name}", np.array([b.probabilities[label] for b in beliefs.values()]), at)
+        for name in next(iter(beliefs.values())).attention:
+            self._curve(f"attention/{name}", np.array([b.attention[name] for b in beliefs.values()]), at)
+        for frame, belief in beliefs.items():
+            if belief.plan is None or len(belief.plan) < 2:
+                continue
+            poses = hand_poses(belief.plan)
+            fading = np.linspace(255, 50, len(poses) - 1).astype(int)
+            for i, side in enumerate(SIDES):
+                path = poses[:, i, :3]
+                trail = rr.LineStrips3D(
+                    np.stack([path[:-1], path[1:]], axis=1),
+                    colors=[(*COLOURS["plan"][i], alpha) for alpha in fading],
+                    radii=[0.004],
+                )
+                self._log_at(frame, f"world/hands/{side}/plan", trail)
+        self._stream.reset_time()
+
+    def _scalars(self) -> None:
+        trace, times, expert = self._trace, self._times, self._reference.state
+        frames = min(len(trace.state), len(expert))
+        gaps = {
+            "tracking_error_mm": (1e3, trace.action, trace.state[1:], times[1:]),
+            "from_expert_cm": (1e2, trace.state[:frames], expert[:frames], times[:frames]),
+        }
+        for i, side in enumerate(SIDES):
+            for name, (unit, ours, theirs, at) in gaps.items():
+                apart = hand_poses(ours)[:, i, :3] - hand_poses(theirs)[:, i, :3]
+                self._curve(f"{name}/{side}", unit * np.linalg.norm(apart, axis=-1), at)
+            self._curve(f"gripper/{side}/commanded", trace.action[:, 8 * i + 7], times[:-1])
+            self._curve(f"gripper/{side}/measured", trace.state[:, 8 * i + 7], times)
+            self._curve(f"grip_force_N/{side}", trace.grip_force[:, i], times)
+            self._curve(f"ik_error_mm/{side}", 1e3 * trace.ik_error[:, i], times[:-1])
+        for pair, touching in trace.contacts.items():
+            for frame in np.flatnonzero(np.diff(touching.astype(int), prepend=-1)):
+                state = rr.StateChange(state="touch" if touching[frame] else "apart")
+                self._log_at(frame, f"contact/{pair.replace(', ', '-')}", state)
+        self._stream.reset_time()
+        self._curve("reward", trace.reward, times[1:])
+        self._curve("progress/stage", trace.stage, times)
+        for measure, values in zip(self._env.task_spec.measures, trace.measures.T, strict=True):
+            self._curve(f"progress/{measure.name}", values, times)
+
+    def _verdict(self) -> None:
+        """Events on the timeline, and the outcome in words."""
+        outcome, times = self._outcome, self._times
+        for frame, failure in enumerate(self._trace.ik_failures):
+            if failure:
+                self._log_at(frame, "log", rr.TextLog(f"no inverse kinematics: {failure}", level="WARN"))
+        left = ""
+        if outcome.departed_frame >= 0:
+            frame = outcome.departed_frame + 1
+            where = f"more than 2 cm from the expert's path, in {outcome.departed_in}"
+            self._log_at(frame, "log", rr.TextLog(where, level="WARN"))
+            left = f"**At {times[frame]:.1f} s first {where}.**\n\n"
+        verdict = "success" if outcome.success else f"failure: {outcome.unmet}"
+        level = "INFO" if outcome.success else "ERROR"
+        self._log_at(len(times) - 1, "log", rr.TextLog(verdict, level=level))
+        self._stream.reset_time()
+        text = (
+            f"**{self._env.task}, seed {outcome.seed}: {verdict}**\n\n{left}"
+            f"Played: {' → '.join(outcome.primitives) or 'no primitives'}\n\n"
+            f"Mean error against the expert: {outcome.position_error_cm:.2f} cm, {outcome.angle_error_rad:.3f} rad. "
+            f"Inverse kinematics failed on {outcome.ik_failures} of {outcome.frames} frames."
+        )
+        self._log("summary", rr.TextDocument(text, media_type="text/markdown"), static=True)
 
 
 def _columns(times: NDArray[np.floating]) -> list[rr.TimeColumn]:
     return [rr.TimeColumn(TIMELINE, duration=times)]
 
 
-def _send_poses(
-    stream: rr.RecordingStream, entity: str, poses: NDArray[np.floating], times: NDArray[np.floating]
+def log_hands(
+    stream: rr.RecordingStream, kind: str, rows: NDArray[np.floating], times: NDArray[np.floating], root: str = ""
 ) -> None:
-    """(T, 7) poses in the world as the transform of an entity."""
-    columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, 3:])
-    stream.send_columns(entity, _columns(times), columns)
-
-
-def _log_scene(stream: rr.RecordingStream, env: BimanualEnv) -> None:
-    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    for body in env.task_spec.bodies:
-        stream.log(
-            f"world/{body.name}/shape",
-            rr.Boxes3D(
-                sizes=[box.size for box in body.boxes],
-                centers=[box.centre for box in body.boxes],
-                quaternions=[box.quaternion for box in body.boxes],
-                colors=[[round(255 * c) for c in box.colour] for box in body.boxes],
-                fill_mode="solid",
-            ),
-            static=True,
-        )
-        if body.name not in env.task_spec.observed:
-            pose = env.world.pose(body.name)
-            stream.log(
-                f"world/{body.name}",
-                rr.Transform3D(translation=pose.position, quaternion=pose.quaternion.tolist()),
-                static=True,
-            )
-
-
-def _log_robot(stream: rr.RecordingStream, env: BimanualEnv, trace: Trace, times: NDArray[np.floating]) -> None:
-    """The robot as the simulation has it, shapes that collide and no meshes: 16 MB less in every file."""
-    spec = env.robot_spec
-    tree = rr.urdf.UrdfTree.from_file_path(spec.urdf(False), entity_path_prefix="robot")
-    tree.log_urdf_to_recording(stream)
-    base: Pose = spec.base
-    stream.log(
-        "robot/base_in_world",
-        rr.Transform3D(
-            translation=base.position,
-            quaternion=base.quaternion.tolist(),
-            parent_frame=WORLD_FRAME,
-            child_frame=tree.root_link().name,
-        ),
-        static=True,
-    )
-    for column, name in enumerate(env.controller.joint_names):
-        joint = tree.get_joint_by_name(name)
-        if joint is None:
-            raise ValueError(f"{spec.name}'s URDF has no joint {name!r}")
-        # A finger that is pressed leaves its limits by a hair: clamping would print a warning for every frame.
-        values = trace.joints[:, column].tolist()
-        stream.send_columns(
-            f"robot/joints/{name}", _columns(times), joint.compute_transform_columns(values, clamp=False)
-        )
-
-
-def _log_hands(stream: rr.RecordingStream, kind: str, rows: NDArray[np.floating], times: NDArray[np.floating]) -> None:
+    """(T, 16) states or actions as the hands' paths, and as points that move along them."""
     poses = hand_poses(rows)
     for i, side in enumerate(SIDES):
-        colour, path = COLOURS[kind][i], poses[:, i, :3]
-        stream.log(
-            f"world/hands/{side}/{kind}_path",
-            rr.LineStrips3D([path], colors=[colour], radii=[0.0015 if kind == "expert" else 0.002]),
-            static=True,
-        )
-        columns = rr.Points3D.columns(
-            positions=path, colors=np.tile(colour, (len(path), 1)), radii=np.full(len(path), 0.012)
-        ).partition([1] * len(path))
-        stream.send_columns(f"world/hands/{side}/{kind}", _columns(times), columns)
+        colour, path, hand = COLOURS[kind][i], poses[:, i, :3], f"{root}world/hands/{side}/{kind}"
+        radius = 0.0015 if kind == "expert" else 0.002
+        stream.log(f"{hand}_path", rr.LineStrips3D([path], colors=[colour], radii=[radius]), static=True)
+        stream.log(hand, rr.Points3D.from_fields(colors=[colour], radii=[0.012]), static=True)
+        columns = rr.Points3D.columns(positions=path).partition([1] * len(path))
+        stream.send_columns(hand, _columns(times), columns)
 
 
-def _log_primitives(stream: rr.RecordingStream, env: BimanualEnv, trace: Trace, times: NDArray[np.floating]) -> None:
-    """A lane of the expert's labels and one of the policy's."""
-    names = env.task_spec.labels
-    for lane, labels in (("scripted", trace.scripted), ("predicted", trace.predicted)):
-        for i in np.flatnonzero(np.diff(labels, prepend=-2)):
-            if labels[i] >= 0:
-                stream.set_time(TIMELINE, duration=float(times[i]))
-                stream.log(f"primitive/{lane}", rr.StateChange(state=names[labels[i]]))
-    stream.reset_time()
-
-
-def _send_scalars(
-    stream: rr.RecordingStream, entity: str, values: NDArray[np.floating], at: NDArray[np.floating]
+def log_lane(
+    stream: rr.RecordingStream,
+    entity: str,
+    labels: NDArray[np.integer],
+    names: tuple[str, ...],
+    times: NDArray[np.floating],
 ) -> None:
-    stream.send_columns(entity, _columns(at), rr.Scalars.columns(scalars=np.asarray(values, dtype=np.float64)))
-
-
-def _log_beliefs(stream: rr.RecordingStream, env: BimanualEnv, trace: Trace, times: NDArray[np.floating]) -> None:
-    """The planner's probabilities, who receives the model's attention, and each plan as a trail that fades to its end."""
-    frames = [i for i, belief in enumerate(trace.beliefs) if belief is not None]
-    beliefs = [belief for belief in trace.beliefs if belief is not None]
-    if not beliefs:
-        return
-    at = times[frames]
-    for label, name in enumerate(env.task_spec.labels):
-        _send_scalars(stream, f"planner/{name}", np.array([b.probabilities[label] for b in beliefs]), at)
-    for name in beliefs[0].attention:
-        _send_scalars(stream, f"attention/{name}", np.array([b.attention[name] for b in beliefs]), at)
-    for time, belief in zip(at, beliefs, strict=True):
-        if belief.plan is None or len(belief.plan) < 2:
-            continue
-        stream.set_time(TIMELINE, duration=float(time))
-        poses = hand_poses(belief.plan)
-        fading = np.linspace(255, 50, len(poses) - 1).astype(int)
-        for i, side in enumerate(SIDES):
-            path = poses[:, i, :3]
-            stream.log(
-                f"world/hands/{side}/plan",
-                rr.LineStrips3D(
-                    np.stack([path[:-1], path[1:]], axis=1),
-                    colors=[(*COLOURS["plan"][i], alpha) for alpha in fading],
-                    radii=[0.004],
-                ),
-            )
-    stream.reset_time()
-
-
-def _log_scalars(
-    stream: rr.RecordingStream, env: BimanualEnv, outcome: Outcome, trace: Trace, times: NDArray[np.floating]
-) -> None:
-    told, went = hand_poses(trace.action), hand_poses(trace.state[1:])
-    for i, side in enumerate(SIDES):
-        _send_scalars(
-            stream,
-            f"tracking_error_mm/{side}",
-            1e3 * np.linalg.norm(told[:, i, :3] - went[:, i, :3], axis=-1),
-            times[1:],
-        )
-        _send_scalars(stream, f"gripper/{side}/commanded", trace.action[:, 8 * i + 7], times[:-1])
-        _send_scalars(stream, f"gripper/{side}/measured", trace.state[:, 8 * i + 7], times)
-        _send_scalars(stream, f"grip_force_N/{side}", trace.grip_force[:, i], times)
-        _send_scalars(stream, f"ik_error_mm/{side}", 1e3 * trace.ik_error[:, i], times[:-1])
-    for pair, touching in trace.contacts.items():
-        entity = f"contact/{pair.replace(', ', '-')}"
-        for frame in np.flatnonzero(np.diff(touching.astype(int), prepend=-1)):
-            stream.set_time(TIMELINE, duration=float(times[frame]))
-            stream.log(entity, rr.StateChange(state="touch" if touching[frame] else "apart"))
-    stream.reset_time()
-    _send_scalars(stream, "reward", trace.reward, times[1:])
-    _send_scalars(stream, "progress/stage", trace.stage, times)
-    for measure, values in zip(env.task_spec.measures, trace.measures.T, strict=True):
-        _send_scalars(stream, f"progress/{measure.name}", values, times)
-    for i, failure in enumerate(trace.ik_failures):
-        if failure:
+    """Labels (T,) as a lane that changes where they do; -1 is nothing."""
+    for i in np.flatnonzero(np.diff(labels, prepend=-2)):
+        if labels[i] >= 0:
             stream.set_time(TIMELINE, duration=float(times[i]))
-            stream.log("log", rr.TextLog(f"no inverse kinematics: {failure}", level="WARN"))
-    stream.set_time(TIMELINE, duration=float(times[-1]))
-    verdict = "success" if outcome.success else f"failure: {outcome.unmet}"
-    stream.log("log", rr.TextLog(verdict, level="INFO" if outcome.success else "ERROR"))
+            stream.log(entity, rr.StateChange(state=names[labels[i]]))
     stream.reset_time()
-    stream.log(
-        "summary",
-        rr.TextDocument(
-            f"**{env.task}, seed {outcome.seed}: {verdict}**\n\n"
-            f"Played: {' → '.join(outcome.primitives) or 'no primitives'}\n\n"
-            f"Mean error against the expert: {outcome.position_error_cm:.2f} cm, {outcome.angle_error_rad:.3f} rad. "
-            f"Inverse kinematics failed on {outcome.ik_failures} of {outcome.frames} frames.",
-            media_type="text/markdown",
-        ),
-        static=True,
+
+
+def _scene_view(env: BimanualEnv, root: str, name: str) -> rrb.Spatial3DView:
+    hidden = f"- /{root}robot/{env.robot_spec.name}/collision_geometries/**"
+    return rrb.Spatial3DView(
+        origin=f"{root}world",
+        contents=[f"+ /{root}world/**", f"+ /{root}robot/**", hidden],
+        name=name,
+        eye_controls=rrb.EyeControls3D(position=env.task_spec.camera.eye, look_target=env.task_spec.camera.target),
     )
 
 
-def _blueprint(env: BimanualEnv) -> rrb.Blueprint:
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(
-                rrb.Spatial3DView(
-                    origin="world",
-                    contents=["+ /world/**", "+ /robot/**", f"- /robot/{env.robot_spec.name}/collision_geometries/**"],
-                    name=env.task,
-                    eye_controls=rrb.EyeControls3D(
-                        position=env.task_spec.camera.eye, look_target=env.task_spec.camera.target
-                    ),
-                ),
-                rrb.StateTimelineView(origin="primitive", name="Primitives: expert's and policy's"),
-                rrb.StateTimelineView(origin="contact", name="Who touches whom"),
-                row_shares=[4, 1, 1],
-            ),
-            rrb.Vertical(
-                rrb.TextDocumentView(origin="summary", name="Outcome"),
-                rrb.Tabs(
-                    rrb.TimeSeriesView(origin="planner", name="Planner's probabilities"),
-                    rrb.TimeSeriesView(origin="attention", name="Attention received"),
-                ),
-                rrb.Tabs(
-                    rrb.TimeSeriesView(origin="tracking_error_mm", name="Hand to command, mm"),
-                    rrb.TimeSeriesView(origin="ik_error_mm", name="Inverse kinematics, mm"),
-                ),
-                rrb.Tabs(
-                    rrb.TimeSeriesView(origin="grip_force_N", name="Grip, N"),
-                    rrb.TimeSeriesView(origin="gripper", name="Gripper opening"),
-                ),
-                rrb.TimeSeriesView(origin="progress", name="Stage and measures"),
-                rrb.TextLogView(origin="log", name="Events"),
-            ),
-            column_shares=[3, 1],
+def _blueprint(env: BimanualEnv, players: list[str]) -> rrb.Blueprint:
+    if players == [""]:
+        return rrb.Blueprint(_alone(env), collapse_panels=True)
+    return rrb.Blueprint(rrb.Horizontal(*(_beside(env, player) for player in players)), collapse_panels=True)
+
+
+def _alone(env: BimanualEnv) -> rrb.Horizontal:
+    return rrb.Horizontal(
+        rrb.Vertical(
+            _scene_view(env, "", env.task),
+            rrb.StateTimelineView(origin="primitive", name="Primitives: scripted, predicted, executed"),
+            rrb.StateTimelineView(origin="contact", name="Who touches whom"),
+            row_shares=[4, 1, 1],
         ),
-        collapse_panels=True,
+        rrb.Vertical(
+            rrb.TextDocumentView(origin="summary", name="Outcome"),
+            rrb.Tabs(
+                rrb.TimeSeriesView(origin="planner", name="Planner's probabilities"),
+                rrb.TimeSeriesView(origin="attention", name="Attention received"),
+            ),
+            rrb.Tabs(
+                rrb.TimeSeriesView(origin="from_expert_cm", name="Hand to expert's, cm"),
+                rrb.TimeSeriesView(origin="tracking_error_mm", name="Hand to command, mm"),
+                rrb.TimeSeriesView(origin="ik_error_mm", name="Inverse kinematics, mm"),
+            ),
+            rrb.Tabs(
+                rrb.TimeSeriesView(origin="grip_force_N", name="Grip, N"),
+                rrb.TimeSeriesView(origin="gripper", name="Gripper opening"),
+            ),
+            rrb.Tabs(
+                rrb.TimeSeriesView(origin="progress", name="Stage and measures"),
+                rrb.TimeSeriesView(origin="reward", name="Reward"),
+            ),
+            rrb.TextLogView(origin="log", name="Events"),
+        ),
+        column_shares=[3, 1],
+    )
+
+
+def _beside(env: BimanualEnv, player: str) -> rrb.Vertical:
+    return rrb.Vertical(
+        rrb.TextDocumentView(origin=f"{player}/summary", name=f"{player}: outcome"),
+        _scene_view(env, f"{player}/", f"{player}: {env.task}"),
+        rrb.StateTimelineView(origin=f"{player}/primitive", name=f"{player}: primitives"),
+        rrb.Tabs(
+            rrb.TimeSeriesView(origin=f"{player}/from_expert_cm", name="Hand to expert's, cm"),
+            rrb.TimeSeriesView(origin=f"{player}/planner", name="Planner's probabilities"),
+            rrb.TimeSeriesView(origin=f"{player}/grip_force_N", name="Grip, N"),
+        ),
+        row_shares=[1.2, 4, 1.2, 1.6],
     )

@@ -17,9 +17,7 @@ from hdril.evaluation import (
     Outcome,
     Reference,
     ReferenceCache,
-    Trace,
     check_held_out,
-    demonstrate_trace,
     judge,
     training_provenance,
 )
@@ -29,6 +27,7 @@ from hdril.recording import Provenance, Recipe
 from hdril.report import Run, headline, write_report
 from hdril.rerun_log import recording_name, write_recording
 from hdril.statistics import wilson_interval
+from hdril.trace import Trace, demonstrate_trace
 
 
 def test_wilson_interval_matches_its_formula() -> None:
@@ -65,16 +64,12 @@ def test_errors_of_a_known_offset() -> None:
     np.testing.assert_allclose(trajectory_error(turned, straight(50)).angle, 0.05)  # one hand of two by 0.1 rad
 
 
-def expert_of(trace: Trace) -> Reference:
-    return Reference(trace.state, trace.scripted)
-
-
 @pytest.fixture(scope="module")
 def played() -> tuple[BimanualEnv, Trace, Outcome]:
     """The expert's episode of a seed, judged against itself."""
     env = BimanualEnv("table_lift")
     trace = demonstrate_trace(env, Demonstrator(env.task_spec, Noise(0.0)), 940_000)
-    return env, trace, judge(env.task_spec, 940_000, trace, expert_of(trace), True, "")
+    return env, trace, judge(env.task_spec, 940_000, trace, Reference.of(trace), True, "")
 
 
 def test_the_expert_has_no_error_against_itself(played) -> None:
@@ -117,7 +112,7 @@ def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path:
                replace(b, attention={"table": 1.0}) for b in trace.beliefs]  # fmt: skip
     beliefs[0] = replace(beliefs[0], plan=trace.action[:10])
     wrong = replace(trace, beliefs=tuple(beliefs))
-    path = write_recording(tmp_path, env, failed, wrong, expert_of(trace))
+    path = write_recording(tmp_path, env, failed, wrong, Reference.of(trace))
     assert path.name == "seed_0940000_failure.rrd"
     assert recording_name(outcome) == "seed_0940000_success"
     text = read_back(path)
@@ -132,6 +127,8 @@ def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path:
         "/primitive/predicted",
         "/tracking_error_mm/left",
         "/planner/grasp",
+        "/primitive/executed",
+        "/from_expert_cm/left",
         "/attention/table",
         "/world/hands/right/plan",
         "/grip_force_N/right",
@@ -144,7 +141,7 @@ def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path:
     ):
         assert f"entity_path: {entity} " in text, entity
     assert "failure: table at rest" in text
-    lanes = text.split("entity_path: /primitive/predicted")[1:]
+    lanes = text.split("entity_path: /primitive/executed")[1:]
     assert not any("lift" in lane.split("entity_path:")[0] for lane in lanes)
     assert any("lift" in lane.split("entity_path:")[0] for lane in text.split("entity_path: /primitive/scripted")[1:])
 
@@ -156,12 +153,12 @@ def test_planner_is_scored_by_frames_and_at_boundaries(played) -> None:
     first = int(np.flatnonzero(trace.scripted == lift)[0])
     beliefs = list(trace.beliefs)
     beliefs[first] = replace(beliefs[first], probabilities=np.eye(6)[move])
-    outcome = judge(env.task_spec, 0, replace(trace, beliefs=tuple(beliefs)), expert_of(trace), True, "")
+    outcome = judge(env.task_spec, 0, replace(trace, beliefs=tuple(beliefs)), Reference.of(trace), True, "")
     assert outcome.planner_confusion[lift][move] == 1
     assert np.trace(outcome.planner_confusion) == 69
     assert outcome.planner_boundary_hits == [True, True, False, True, True, True]
     nobody = replace(trace, beliefs=(None,) * len(trace.beliefs))
-    assert judge(env.task_spec, 0, nobody, expert_of(trace), True, "").planner_confusion == []
+    assert judge(env.task_spec, 0, nobody, Reference.of(trace), True, "").planner_confusion == []
 
 
 def test_report_says_what_happened(played, tmp_path: Path) -> None:

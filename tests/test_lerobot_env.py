@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -61,9 +62,9 @@ class Scripted(PreTrainedPolicy):
         return self.select_action(batch)[:, None]
 
 
-def outcomes(task: str, n_envs: int, use_async: bool, episodes: int) -> dict[int, bool]:
+def outcomes(task: str, n_envs: int, use_async: bool, episodes: int, **options) -> dict[int, bool]:
     """Success by seed, from LeRobot's own evaluation loop."""
-    vector = make_env(HDRILEnvConfig(task=task), n_envs=n_envs, use_async_envs=use_async)["hdril"][0]
+    vector = make_env(HDRILEnvConfig(task=task, **options), n_envs=n_envs, use_async_envs=use_async)["hdril"][0]
     around_env = [PolicyProcessorPipeline(steps=[]) for _ in range(2)]
     around_policy = [lambda data: data] * 2
     with closing(vector):
@@ -77,6 +78,25 @@ def test_same_outcomes_for_one_several_and_asynchronous_environments(task: str) 
     assert set(one.values()) == {True, False}, "the seeds should hold both outcomes"
     assert outcomes(task, 3, False, 6) == one
     assert outcomes(task, 2, True, 6) == one
+
+
+@pytest.mark.parametrize(("rerun", "kept"), [("failures", {False}), ("all", {True, False})])
+def test_environments_write_recordings(rerun: str, kept: set[bool], tmp_path: Path) -> None:
+    """One file for every episode that is to be kept, named by its seed and outcome, and no other."""
+    options = {"rerun": rerun, "rerun_dir": str(tmp_path / "rerun")}
+    found = outcomes("table_lift", 2, rerun == "all", 4, **options)
+    assert set(found.values()) == {True, False}
+    words = {True: "success", False: "failure"}
+    names = {f"seed_{seed:07d}_{words[success]}.rrd" for seed, success in found.items() if success in kept}
+    files = list((tmp_path / "rerun").iterdir())
+    assert {file.name for file in files} == names
+    for file in files:
+        assert 100_000 < file.stat().st_size < 2_000_000
+
+
+def test_unknown_choice_of_recordings_is_named() -> None:
+    with pytest.raises(ValueError, match=r"env\.rerun must be failures, all, none or a number, got 'some'"):
+        make_env(HDRILEnvConfig(task="table_lift", rerun="some"))
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -14,7 +14,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from hdril.cli.common import run
-from hdril.evaluation import Job, Outcome, check_held_out, evaluate, training_provenance
+from hdril.evaluation import Job, Outcome, check_held_out, check_keep, evaluate, training_provenance
 from hdril.report import Run, headline, write_report
 from hdril.tasks import get_task
 
@@ -58,8 +58,7 @@ def _check(config: EvalConfig) -> None:
     for name, least in (("num_episodes", 1), ("seed", 0), ("workers", 1)):
         if getattr(config, name) < least:
             raise ValueError(f"{name} must be at least {least}, got {getattr(config, name)}")
-    if config.rerun not in ("failures", "all", "none") and not config.rerun.isdigit():
-        raise ValueError(f"rerun must be failures, all, none or a number, got {config.rerun!r}")
+    check_keep("rerun", config.rerun)
     path = Path(config.policy.path)
     looks_local = path.is_absolute() or path.parts[:1] in ((".",), ("..",)) or len(path.parts) != 2
     if not (path / "config.json").exists() and (looks_local or path.exists()):
