@@ -263,15 +263,18 @@ class Worker:
         self._references = ReferenceCache(self.env)
         self._actor = LeRobotActor(self.job.policy, self.env.task_spec, self.job.overrides, self.job.device)
 
-    def run(self, seed: int) -> Outcome:
-        """Expert and policy on the scene of ``seed``; writes the Rerun file if the episode is to be kept."""
-        task = self.env.task_spec
+    def play(self, seed: int) -> tuple[Outcome, Trace, Reference]:
+        """Expert and policy on the scene of ``seed``."""
         reference = self._references.get(seed)
         self._actor.reset(seed)
         trace, success, unmet = run_episode(self.env, self._actor.act, seed, reference.scripted)
-        outcome = judge(task, seed, trace, reference, success, unmet)
+        return judge(self.env.task_spec, seed, trace, reference, success, unmet), trace, reference
+
+    def run(self, seed: int) -> Outcome:
+        """Play the scene of ``seed``; writes the Rerun file if the episode is to be kept."""
+        outcome, trace, reference = self.play(seed)
         number = seed - self.job.first_seed
-        if self.job.recordings is not None and keeps(self.job.keep, number, success):
+        if self.job.recordings is not None and keeps(self.job.keep, number, outcome.success):
             from hdril.rerun_log import write_recording
 
             write_recording(self.job.recordings, self.env, outcome, trace, reference)

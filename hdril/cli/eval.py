@@ -51,10 +51,17 @@ class EvalConfig:
     """Folder of the results; must not exist. Default: outputs/eval/<task>_<time>."""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Processes. The outcomes are the same for any number."""
+    push: str = ""
+    """Publish results, and the checkpoint if it is a folder, in this model repository (user/name) of the Hugging Face Hub, and
+    write them into its card. If output_dir holds this very evaluation already, it is published without playing anew."""
+    private: bool = True
+    """Whether a repository that --push makes is private."""
 
 
 def _check(config: EvalConfig) -> None:
     get_task(config.task)
+    if config.push and config.push.count("/") != 1:
+        raise ValueError(f"push must look like user/name, got {config.push!r}")
     for name, least in (("num_episodes", 1), ("seed", 0), ("workers", 1)):
         if getattr(config, name) < least:
             raise ValueError(f"{name} must be at least {least}, got {getattr(config, name)}")
@@ -70,7 +77,7 @@ def _check(config: EvalConfig) -> None:
 def eval_command(config: EvalConfig, overrides: tuple[str, ...] = ()) -> None:
     _check(config)
     output = config.output_dir or Path("outputs/eval") / f"{config.task}_{time.strftime('%Y-%m-%d_%H-%M-%S')}"
-    if output.exists():
+    if output.exists() and not config.push:
         raise FileExistsError(f"{output} exists; choose another output_dir or delete it")
     seeds = list(range(config.seed, config.seed + config.num_episodes))
     held_out = check_held_out(training_provenance(config.policy.path), config.task, seeds)
@@ -79,6 +86,10 @@ def eval_command(config: EvalConfig, overrides: tuple[str, ...] = ()) -> None:
             f"Note: the training data of {config.policy.path} are not at hand; whether these seeds were in them is not known."
         )
     what = Run(config.task, config.policy.path, overrides, config.seed, config.num_episodes, held_out)
+    if output.exists():
+        _check_same(output, what)
+        _push(config, output)
+        return
     partial = output.with_name(output.name + ".partial")
     done = _resume(partial, what)
     job = Job(
@@ -103,7 +114,39 @@ def eval_command(config: EvalConfig, overrides: tuple[str, ...] = ()) -> None:
     print(f"{headline(summary)}; {time.monotonic() - start:.0f} s")
     print(f"Report: {output / 'report.md'}")
     if recordings:
-        print(f"{len(recordings)} recordings: rerun {recordings[0]}")
+        print(f"{len(recordings)} recordings: hdril-view --run={output}")
+    if config.push:
+        _push(config, output)
+
+
+def _check_same(output: Path, what: Run) -> None:
+    """Raises FileExistsError unless ``output`` holds the results of ``what``."""
+    path = output / "results.json"
+    values = json.loads(path.read_text()) if path.exists() else {}
+    if any(values.get(name) != value for name, value in json.loads(json.dumps(asdict(what))).items()):
+        raise FileExistsError(f"{output} exists and holds something else; choose another output_dir or delete it")
+
+
+def _push(config: EvalConfig, output: Path) -> None:
+    """Results and report, the card, and the checkpoint if it lies here, in one commit."""
+    from huggingface_hub import ModelCard
+
+    from hdril.cards import checkpoint_card, folder_of, with_evaluation
+    from hdril.hub import publish, read_text
+
+    summary = json.loads((output / "results.json").read_text())
+    folder, checkpoint = folder_of(summary), Path(config.policy.path)
+    files: dict[str, Path | bytes] = {
+        f"{folder}/{name}": output / name for name in ("results.json", "report.md", "report.png")
+    }
+    text = read_text(config.push, "README.md", "model")
+    if (checkpoint / "config.json").exists():
+        # What LeRobot publishes of a checkpoint: no pickles.
+        files |= {path.name: path for path in checkpoint.iterdir() if path.suffix in (".safetensors", ".json", ".yaml")}
+        text = text or checkpoint_card(checkpoint, config.push)
+    card = with_evaluation(ModelCard(text or f"# {config.push}\n"), summary, config.push)
+    files["README.md"] = str(card).encode()
+    print(f"Published: {publish(config.push, 'model', files, headline(summary), config.private)}")
 
 
 def _play(job: Job, seeds: list[int], workers: int, outcomes: list[Outcome], journal: Path) -> None:

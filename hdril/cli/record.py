@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ from tqdm import tqdm
 
 from hdril.cli.common import run
 from hdril.primitives import Noise
-from hdril.recording import Recipe, record
+from hdril.recording import Recipe, read_provenance, record
 
 
 @dataclass
@@ -36,6 +37,11 @@ class RecordConfig:
     """Processes that simulate. The dataset is the same for any number."""
     noise: Noise = field(default_factory=Noise)
     """Noise of the demonstrations."""
+    push: bool = False
+    """Publish the dataset on the Hugging Face Hub under repo_id, with a card. If it is at root already and is what these
+    options make, it is published without recording anew."""
+    private: bool = True
+    """Whether a repository that --push makes is private."""
 
 
 def record_command(config: RecordConfig) -> None:
@@ -43,6 +49,10 @@ def record_command(config: RecordConfig) -> None:
         raise ValueError(f"repo_id must look like user/name, got {config.repo_id!r}")
     recipe = Recipe(config.task, config.noise)
     root = config.root or _default_root(config.repo_id)
+    if config.push and root.exists():
+        _check_same(root, recipe, config)
+        _push(config, root)
+        return
     start = time.monotonic()
     with tqdm(total=max(config.num_episodes, 0), desc=f"recording {config.task}", unit="episode") as bar:
 
@@ -63,6 +73,32 @@ def record_command(config: RecordConfig) -> None:
     )
     for seed, why in recording.dropped.items():
         print(f"  dropped seed {seed}: {why}")
+    if config.push:
+        _push(config, root)
+
+
+def _check_same(root: Path, recipe: Recipe, config: RecordConfig) -> None:
+    """Raises FileExistsError unless the dataset at ``root`` is what the options ask for."""
+    provenance = read_provenance(root)
+    asked = (recipe, config.num_episodes, config.seed)
+    if provenance is None or asked != (provenance.recipe, len(provenance.seeds), min(provenance.seeds)):
+        raise FileExistsError(f"{root} exists and holds something else; choose another root or delete it")
+
+
+def _push(config: RecordConfig, root: Path) -> None:
+    from hdril.cards import dataset_card
+    from hdril.hub import publish
+
+    files: dict[str, Path | bytes] = {
+        str(path.relative_to(root)): path
+        for folder in ("data", "meta")
+        for path in sorted((root / folder).rglob("*.*"))
+    }
+    files["README.md"] = dataset_card(config.repo_id, root).encode()
+    # LeRobot finds the version of a dataset's format by this tag.
+    tag = json.loads((root / "meta/info.json").read_text())["codebase_version"]
+    message = f"{config.num_episodes} episodes of {config.task}"
+    print(f"Published: {publish(config.repo_id, 'dataset', files, message, config.private, tag)}")
 
 
 def _default_root(repo_id: str) -> Path:

@@ -133,7 +133,9 @@ class HDRILConfig(PreTrainedConfig):
         if self.latent == "deterministic" and (self.kl_weight or self.samples):
             raise ValueError("policy.kl_weight and policy.samples are for policy.latent=variational")
         if self.experts == "stacked" and self.decoder == "ode":
-            raise ValueError("policy.experts=stacked works with policy.decoder=gru: the ODE's solver cannot be batched so")
+            raise ValueError(
+                "policy.experts=stacked works with policy.decoder=gru: the ODE's solver cannot be batched so"
+            )
         if self.replan_every < 0:
             raise ValueError(f"policy.replan_every must be 0 (never) or more frames, got {self.replan_every}")
 

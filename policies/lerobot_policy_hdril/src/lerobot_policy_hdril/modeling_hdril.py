@@ -11,6 +11,7 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from lerobot_policy_hdril.card import model_card
 from lerobot_policy_hdril.configuration_hdril import HDRILConfig
 from lerobot_policy_hdril.coordinates import RelationalCoordinates
 from lerobot_policy_hdril.demonstrations import Demonstrations, History, Window
@@ -19,6 +20,8 @@ from lerobot_policy_hdril.graph import group_nodes, quaternion_groups
 from lerobot_policy_hdril.planner import Planner
 
 if TYPE_CHECKING:
+    from huggingface_hub import ModelCard
+    from lerobot.configs.train import TrainPipelineConfig
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 
@@ -294,6 +297,18 @@ class HDRILPolicy(PreTrainedPolicy):
                 return False
             return bool((primitive != primitive[0]).any())
         return self.config.experts == "stacked"
+
+    def generate_model_card(
+        self,
+        dataset_repo_id: str,
+        model_type: str,
+        license: str | None,
+        tags: list[str] | None,
+        cfg: TrainPipelineConfig | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> ModelCard:
+        """The card that ``lerobot-train --policy.push_to_hub=true`` publishes, see :mod:`lerobot_policy_hdril.card`."""
+        return model_card(self.config, dataset_repo_id, license, tags, cfg, dataset_meta)
 
     # ------------------------------------------------------------------ rollout
 

@@ -1,0 +1,126 @@
+"""The model card of a policy on the Hub."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from huggingface_hub import ModelCard, ModelCardData
+
+from lerobot_policy_hdril.configuration_hdril import HDRILConfig
+
+if TYPE_CHECKING:
+    from lerobot.configs.train import TrainPipelineConfig
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+TAGS = ("bimanual", "hdril", "imitation-learning", "lerobot", "robotics")
+EVALUATION = "## Evaluation"
+"""Heading of the section that ``hdril-eval --push`` fills; it ends at the next heading of its level."""
+NOT_EVALUATED = "_Not evaluated yet: `hdril-eval … --push` writes the results here._"
+CITATION = """@inproceedings{xie2020deep,
+  title = {Deep Imitation Learning for Bimanual Robotic Manipulation},
+  author = {Xie, Fan and Chowdhury, Alexander and De Paolis Kaluza, M. Clara and Zhao, Linfeng and Wong, Lawson L. S.
+    and Yu, Rose},
+  booktitle = {Advances in Neural Information Processing Systems},
+  year = {2020}
+}"""
+_CHOICES = ("preset", "interaction", "skip", "state_skip", "per_primitive", "decoder", "coordinates", "latent", "rollout",
+            "replan_every", "hidden_dim")  # fmt: skip
+
+
+def simulated_task(dataset_meta: LeRobotDatasetMetadata | None) -> str | None:
+    """The task of ``--env.type=hdril`` that a dataset is of; None if hdril did not record it."""
+    if dataset_meta is None:
+        return None
+    path = Path(dataset_meta.root) / "meta/hdril.json"
+    return json.loads(path.read_text())["recipe"]["task"] if path.exists() else None
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[object, ...]]) -> str:
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    return "\n".join([*lines, *("| " + " | ".join(map(str, row)) + " |" for row in rows)])
+
+
+def model_card(
+    config: HDRILConfig,
+    dataset_repo_id: str,
+    license: str | None,
+    tags: list[str] | None,
+    training: TrainPipelineConfig | None,
+    dataset_meta: LeRobotDatasetMetadata | None,
+) -> ModelCard:
+    """What the policy is, what it takes and gives, what it learned from, how to run it, and room for its evaluation."""
+    license, repo_id = license or "apache-2.0", config.repo_id or "<user>/<policy>"
+    data = ModelCardData(
+        license=license, library_name="lerobot", pipeline_tag="robotics", model_name="hdril", datasets=dataset_repo_id,
+        tags=sorted({*TAGS, *(tags or [])}),
+    )  # fmt: skip
+    task = simulated_task(dataset_meta)
+    features = {**(config.input_features or {}), **(config.output_features or {})}
+    names = (config.state_names, config.environment_names, config.action_names)
+    learned = [("dataset", f"[{dataset_repo_id}](https://huggingface.co/datasets/{dataset_repo_id})")]
+    if dataset_meta is not None:
+        learned += [
+            ("episodes", dataset_meta.total_episodes), ("frames", dataset_meta.total_frames),
+            ("frames per second", dataset_meta.fps), ("robot", dataset_meta.robot_type or "not named"),
+        ]  # fmt: skip
+    if training is not None:
+        learned += [("steps", training.steps), ("batch size", training.batch_size), ("seed", training.seed)]
+    lengths = [f"{low}" if low == high else f"{low} to {high}" for low, high in config.primitive_lengths]
+    command = (
+        f"lerobot-eval --policy.path={repo_id} --env.type=hdril --env.task={task or '<task>'} --eval.n_episodes=100"
+    )
+    choices: list[tuple[Any, ...]] = [(f"`{name}`", f"`{getattr(config, name)}`") for name in _CHOICES]
+    text = f"""---
+{data.to_yaml()}
+---
+
+# HDR-IL: {task or dataset_repo_id}
+
+Hierarchical deep relational imitation learning ([Xie et al., NeurIPS 2020](https://arxiv.org/abs/2010.05134)) as a
+LeRobot policy: a planner picks the next primitive, one graph-recurrent dynamics model per primitive predicts its
+trajectory, and the policy looks again when the primitive is over.
+
+Weights are safetensors; the policy's code comes with the Python package `lerobot_policy_hdril`, and no remote code is run.
+
+## Use
+
+```
+{command} --eval.batch_size=1 --seed=200000
+hdril-eval --policy.path={repo_id} --task={task or "<task>"} --num_episodes=100
+```
+
+## Inputs and outputs
+
+{
+        _table(
+            ("feature", "shape", "numbers"),
+            [
+                (f"`{key}`", tuple(feature.shape), ", ".join(numbers))
+                for (key, feature), numbers in zip(features.items(), names, strict=False)
+            ],
+        )
+    }
+
+{_table(("primitive", "frames"), list(zip(config.primitives, lengths, strict=True)))}
+
+## Training
+
+{_table(("", ""), learned)}
+
+{_table(("option", "value"), choices)}
+
+{EVALUATION}
+
+{NOT_EVALUATED}
+
+## Citation
+
+```bibtex
+{CITATION}
+```
+
+License: {license}
+"""
+    return ModelCard(text)
