@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from colorsys import hsv_to_rgb
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -65,10 +66,15 @@ def write_episodes(path: Path, name: str, env: BimanualEnv, episodes: list[Playe
     return path
 
 
+def _robot_entity(root: str) -> str:
+    """Where a player's robot is: at the top, because Rerun's URDF reader takes one part of a path."""
+    return f"{root.removesuffix('/')}_robot" if root else "robot"
+
+
 @lru_cache(maxsize=4)
 def _robot_tree(path: str, root: str) -> rr.urdf.UrdfTree:
     """Once a process: reading the URDF takes as long as all the curves of an episode."""
-    return rr.urdf.UrdfTree.from_file_path(path, entity_path_prefix=f"{root}robot", frame_prefix=root or None)
+    return rr.urdf.UrdfTree.from_file_path(path, entity_path_prefix=_robot_entity(root), frame_prefix=root or None)
 
 
 class _EpisodeLog:
@@ -139,14 +145,15 @@ class _EpisodeLog:
             parent_frame=f"tf#/{self._root}world",
             child_frame=f"{self._root}{tree.root_link().name}",
         )
-        self._log("robot/base_in_world", place, static=True)
+        entity = _robot_entity(self._root)
+        self._stream.log(f"{entity}/base_in_world", place, static=True)
         for column, name in enumerate(self._env.controller.joint_names):
             joint = tree.get_joint_by_name(name)
             if joint is None:
                 raise ValueError(f"{spec.name}'s URDF has no joint {name!r}")
             # A finger that is pressed leaves its limits by a hair: clamping would print a warning for every frame.
             columns = joint.compute_transform_columns(self._trace.joints[:, column].tolist(), clamp=False)
-            self._stream.send_columns(f"{self._root}robot/joints/{name}", _columns(self._times), columns)
+            self._stream.send_columns(f"{entity}/joints/{name}", _columns(self._times), columns)
 
     def _beliefs(self) -> None:
         """The planner's probabilities, who receives the model's attention, and each plan as a trail that fades to its end."""
@@ -168,7 +175,7 @@ class _EpisodeLog:
                 trail = rr.LineStrips3D(
                     np.stack([path[:-1], path[1:]], axis=1),
                     colors=[(*COLOURS["plan"][i], alpha) for alpha in fading],
-                    radii=[0.004],
+                    radii=[0.007],
                 )
                 self._log_at(frame, f"world/hands/{side}/plan", trail)
         self._stream.reset_time()
@@ -234,11 +241,17 @@ def log_hands(
     poses = hand_poses(rows)
     for i, side in enumerate(SIDES):
         colour, path, hand = COLOURS[kind][i], poses[:, i, :3], f"{root}world/hands/{side}/{kind}"
-        radius = 0.0015 if kind == "expert" else 0.002
+        radius = 0.002 if kind == "expert" else 0.004
         stream.log(f"{hand}_path", rr.LineStrips3D([path], colors=[colour], radii=[radius]), static=True)
         stream.log(hand, rr.Points3D.from_fields(colors=[colour], radii=[0.012]), static=True)
         columns = rr.Points3D.columns(positions=path).partition([1] * len(path))
         stream.send_columns(hand, _columns(times), columns)
+
+
+def _distinct_colours(count: int) -> list[tuple[int, int, int]]:
+    """Colours around the wheel, neighbours far apart; Rerun's own choice gives some neighbours the same."""
+    hues = np.arange(count) * 0.618034 % 1.0
+    return [tuple(round(255 * c) for c in hsv_to_rgb(hue, 0.55, 0.8)) for hue in hues]  # pyright: ignore
 
 
 def log_lane(
@@ -248,7 +261,8 @@ def log_lane(
     names: tuple[str, ...],
     times: NDArray[np.floating],
 ) -> None:
-    """Labels (T,) as a lane that changes where they do; -1 is nothing."""
+    """Labels (T,) as a lane that changes where they do; -1 is nothing. Each label has the same colour in all lanes."""
+    stream.log(entity, rr.StateConfiguration(values=names, colors=_distinct_colours(len(names))), static=True)
     for i in np.flatnonzero(np.diff(labels, prepend=-2)):
         if labels[i] >= 0:
             stream.set_time(TIMELINE, duration=float(times[i]))
@@ -257,10 +271,11 @@ def log_lane(
 
 
 def _scene_view(env: BimanualEnv, root: str, name: str) -> rrb.Spatial3DView:
-    hidden = f"- /{root}robot/{env.robot_spec.name}/collision_geometries/**"
+    robot = _robot_entity(root)
+    hidden = f"- /{robot}/{env.robot_spec.name}/collision_geometries/**"
     return rrb.Spatial3DView(
         origin=f"{root}world",
-        contents=[f"+ /{root}world/**", f"+ /{root}robot/**", hidden],
+        contents=[f"+ /{root}world/**", f"+ /{robot}/**", hidden],
         name=name,
         eye_controls=rrb.EyeControls3D(position=env.task_spec.camera.eye, look_target=env.task_spec.camera.target),
     )
@@ -278,7 +293,7 @@ def _alone(env: BimanualEnv) -> rrb.Horizontal:
             _scene_view(env, "", env.task),
             rrb.StateTimelineView(origin="primitive", name="Primitives: scripted, predicted, executed"),
             rrb.StateTimelineView(origin="contact", name="Who touches whom"),
-            row_shares=[4, 1, 1],
+            row_shares=[4, 1.45, 1.3],
         ),
         rrb.Vertical(
             rrb.TextDocumentView(origin="summary", name="Outcome"),
@@ -315,5 +330,5 @@ def _beside(env: BimanualEnv, player: str) -> rrb.Vertical:
             rrb.TimeSeriesView(origin=f"{player}/planner", name="Planner's probabilities"),
             rrb.TimeSeriesView(origin=f"{player}/grip_force_N", name="Grip, N"),
         ),
-        row_shares=[1.2, 4, 1.2, 1.6],
+        row_shares=[1.2, 4, 1.6, 1.6],
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,6 +86,8 @@ def _names(first: Path, second: Path) -> tuple[str, str]:
     """Names of two folders that tell them apart."""
     one, two = first.resolve().parts, second.resolve().parts
     for a, b in zip(reversed(one), reversed(two), strict=False):
+        # They become part of entity paths.
+        a, b = (re.sub(r"[^\w.-]", "_", name) for name in (a, b))
         if a != b:
             return a, b
     return "first", "second"

@@ -39,12 +39,8 @@ def runs(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, P
     policy = make_policy(HDRILConfig(device="cpu", push_to_hub=False, ridge=1e-4), ds_meta=metadata)
     train_planner(policy)
     checkpoints = {"whole": save(policy, metadata, base / "policies/whole")}
-    with torch.no_grad():
-        lift = policy.dynamics[policy.config.primitives.index("lift")]
-        for value in (*lift.parameters(), *lift.buffers()):
-            if value.is_floating_point():
-                value.zero_()
-    checkpoints["damaged"] = save(policy, metadata, base / "policies/damaged")
+    checkpoints["damaged"] = base / "policies/damaged"
+    run_script("damage.py", checkpoints["whole"], checkpoints["damaged"], "lift")
     found = {}
     for name, checkpoint in checkpoints.items():
         found[name] = base / name / "eval"
@@ -53,6 +49,11 @@ def runs(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, P
                        rerun="failures")
         )  # fmt: skip
     return found
+
+
+def run_script(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(Path(__file__).parents[1] / "scripts" / name), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
 
 
 def train_planner(policy: HDRILPolicy) -> None:
@@ -88,6 +89,14 @@ def test_recording_of_a_damaged_policy_names_the_primitive_that_failed(runs: dic
     assert "lift (1)" in (runs["damaged"] / "report.md").read_text()
 
 
+def test_damage_names_what_can_be_damaged(runs: dict[str, Path], tmp_path: Path) -> None:
+    whole = runs["whole"].parents[1] / "policies/whole"
+    done = run_script("damage.py", whole, tmp_path / "x", "juggle")
+    assert done.returncode == 1
+    assert "no model of its own for 'juggle'; there is one for: grasp, move, lift" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_seed_that_was_not_recorded_is_played_again(runs: dict[str, Path], tmp_path: Path, capsys) -> None:
     assert not (runs["whole"] / "rerun").exists()
     view_command(ViewConfig(run=runs["whole"], seed=SEED, save=tmp_path / "one.rrd"))
@@ -103,11 +112,12 @@ def test_two_policies_side_by_side(runs: dict[str, Path], tmp_path: Path) -> Non
         for entity in (
             "world/table",
             "world/hands/left/executed",
-            "robot/joints/left_s0",
             "primitive/executed",
             "summary",
         ):
             assert f"entity_path: /{player}/{entity} " in text
+        for entity in ("joints/left_s0", "baxter/visual_geometries/head/visual_0"):
+            assert f"entity_path: /{player}_robot/{entity} " in text
     assert "in lift" in text.split("entity_path: /damaged/log")[1].split("entity_path:")[0]
 
 

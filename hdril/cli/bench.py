@@ -17,8 +17,8 @@ from hdril.world import World
 
 @dataclass
 class BenchConfig:
-    """Measure recording against the bare simulator, the loader against a training step, one action, training against
-    LeRobot's ACT, and HDR-IL's models called as one against one by one."""
+    """Measure recording against the bare simulator, the loader against a training step, one action, Rerun
+    recordings against the evaluation, training against LeRobot's ACT, and HDR-IL's models called as one or one by one."""
 
     task: str = "table_lift"
     """Name of the task, with its parameters if it has any (peg_in_hole:clearance=0.004); an unknown one is answered with
@@ -170,6 +170,33 @@ def bench_policies(root: Path) -> list[Figure]:
     ]
 
 
+def bench_rerun(task: str, folder: Path) -> Figure:
+    """Share of an evaluation, the expert's episode included, that its Rerun recording takes; one core. The policy's own time
+    is left out: the share with one is less."""
+    from hdril.demonstrator import Demonstrator
+    from hdril.env import BimanualEnv
+    from hdril.evaluation import Reference, judge
+    from hdril.primitives import Noise
+    from hdril.rerun_log import write_recording
+    from hdril.trace import demonstrate_trace
+
+    env = BimanualEnv(task)
+    expert, seconds = Demonstrator(env.task_spec, Noise(0.0)), {"episodes": 0.0, "recording": 0.0}
+    for seed in range(5):
+        start = time.perf_counter()
+        trace, again = (demonstrate_trace(env, expert, seed) for _ in range(2))
+        reference = Reference.of(again)
+        outcome = judge(env.task_spec, seed, trace, reference, True, "")
+        middle = time.perf_counter()
+        write_recording(folder, env, outcome, trace, reference)
+        if seed:  # the first one starts Rerun
+            seconds["episodes"] += middle - start
+            seconds["recording"] += time.perf_counter() - middle
+    env.close()
+    share = 100.0 * seconds["recording"] / sum(seconds.values())
+    return Figure("Rerun recordings, share of an evaluation", share, 10.0, False, "%")
+
+
 def bench_command(config: BenchConfig) -> None:
     Recipe(config.task)
     with tempfile.TemporaryDirectory() as folder:
@@ -177,6 +204,7 @@ def bench_command(config: BenchConfig) -> None:
         print(bench_recording(config.task, config.episodes, root), flush=True)
         print(bench_training(config.task, root, config.train_steps, Path(folder) / "train"), flush=True)
         print(bench_action(root, config.task), flush=True)
+        print(bench_rerun(config.task, Path(folder) / "rerun"), flush=True)
         for figure in bench_policies(root):
             print(figure, flush=True)
 

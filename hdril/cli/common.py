@@ -6,6 +6,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Any
 
 import draccus
@@ -19,6 +20,16 @@ def _with_underscores(argument: str) -> str:
     return (name[:2] + name[2:].replace("-", "_") + equals + value) if name.startswith("--") else argument
 
 
+def _switches(arguments: list[str], config_class: type[Any]) -> list[str]:
+    """``--web`` as ``--web=true``, for options that are yes or no."""
+    names = {f"--{entry.name}" for entry in fields(config_class) if entry.type in (bool, "bool")}
+    following = [*arguments[1:], "--"]
+    return [
+        f"{argument}=true" if argument in names and after.startswith("--") else argument
+        for argument, after in zip(arguments, following, strict=True)
+    ]
+
+
 def run(program: str, config_class: type[Any], command: Callable[[Any], None]) -> None:
     """Parse the command line and run ``command``; a failure that a user can mend is one line and exit code 2.
 
@@ -26,7 +37,8 @@ def run(program: str, config_class: type[Any], command: Callable[[Any], None]) -
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     try:
-        command(draccus.parse(config_class, args=[_with_underscores(argument) for argument in sys.argv[1:]]))
+        arguments = [_with_underscores(argument) for argument in sys.argv[1:]]
+        command(draccus.parse(config_class, args=_switches(arguments, config_class)))
     except KeyboardInterrupt:
         print(f"\n{program}: interrupted", file=sys.stderr)
         sys.exit(130)
