@@ -3,8 +3,8 @@
 python scripts/presets.py                 trains and evaluates what is missing, then writes docs/presets.md and .json
 python scripts/presets.py --parameters    prints the number of parameters of each preset, and stops
 
-What is done is skipped: after Ctrl-C the same command goes on. Each model trains on the same demonstrations for the same
-number of steps and is evaluated on the same held-out seeds.
+What is done is skipped, be it in the outputs or in the JSON: after Ctrl-C, or on another day, the same command goes on. Each
+model trains on the same demonstrations for the same number of steps and is evaluated on the same held-out seeds.
 """
 
 from __future__ import annotations
@@ -76,13 +76,14 @@ def markdown(results: dict[str, Any]) -> str:
     """The table."""
     header = ("preset", "parameters", "closed loop", "open loop", "position, cm", "angle, rad", "DTW, cm",
               "paper: success", "position, cm", "angle, rad", "DTW")  # fmt: skip
+    commits = sorted({row["commit"] for row in results["presets"].values()})
     lines = [
         f"# The paper's models on {results['task']}",
         "",
         f"{results['demonstrations']} demonstrations, {results['steps']} steps of batch {results['batch_size']} each; "
         f"{results['episodes']} held-out seeds from {results['seed']} on. Made by `python scripts/presets.py` on commit "
-        f"{results['commit']}. Success in percent with the 95 % interval; errors against the expert in the open loop, as "
-        "in the paper, mean ± standard deviation over episodes.",
+        f"{', '.join(commits)}. Success in percent with the 95 % interval; errors against the expert in the open loop, as in the "
+        "paper, mean ± standard deviation over episodes.",
         "",
         "| " + " | ".join(header) + " |",
         "|" + "---|" * len(header),
@@ -107,12 +108,27 @@ def markdown(results: dict[str, Any]) -> str:
     return "\n".join([*lines, ""])
 
 
+def finished(document: Path, settings: dict[str, Any]) -> dict[str, Any]:
+    """Rows of an earlier run with the same settings.
+
+    Raises:
+        SystemExit: the document is of other settings.
+    """
+    if not document.exists():
+        return {}
+    results = json.loads(document.read_text())
+    other = {key: results[key] for key, value in settings.items() if results[key] != value}
+    if other:
+        sys.exit(f"presets: {document} was made with {other}; give the same, or another --document")
+    return results["presets"]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", default="table_lift")
     parser.add_argument("--presets", nargs="+", default=list(PRESETS), choices=list(PRESETS), metavar="PRESET")
     parser.add_argument("--demonstrations", type=int, default=500)
-    parser.add_argument("--steps", type=int, default=2000)
+    parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--batch-size", type=int, default=128)
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--seed", type=int, default=300_000)
@@ -122,6 +138,14 @@ def main() -> None:
     parser.add_argument("--parameters", action="store_true", help="print the numbers of parameters and stop")
     options = parser.parse_args()
     dataset = options.output / ("sample" if options.parameters else "dataset")
+    settings = {
+        key: getattr(options, key) for key in ("task", "demonstrations", "steps", "batch_size", "episodes", "seed")
+    }
+    known = {} if options.parameters else finished(options.document.with_suffix(".json"), settings)
+    missing = [preset for preset in options.presets if preset not in known]
+    if not missing:
+        print(f"{options.document.with_suffix('.json')} has them all")
+        return
     Stage(
         "demonstrations",
         ("hdril-record", f"--task={options.task}", "--repo_id=hdril/presets", f"--root={dataset}",
@@ -140,21 +164,17 @@ def main() -> None:
 
     try:
         with ThreadPoolExecutor(options.jobs) as pool:
-            list(pool.map(run, options.presets))
+            list(pool.map(run, missing))
     except subprocess.CalledProcessError as error:
         sys.exit(f"presets: {error.cmd[0]} failed with exit code {error.returncode}")
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
-    results: dict[str, Any] = {
-        "task": options.task, "demonstrations": options.demonstrations, "steps": options.steps,
-        "batch_size": options.batch_size, "episodes": options.episodes, "seed": options.seed,
-        "commit": commit.stdout.strip(), "presets": {},
-    }  # fmt: skip
-    for preset in options.presets:
-        row: dict[str, Any] = {"parameters": parameters(preset, dataset)}
+    for preset in missing:
+        row: dict[str, Any] = {"commit": commit.stdout.strip(), "parameters": parameters(preset, dataset)}
         for rollout in ROLLOUTS:
             summary = json.loads((options.output / preset / rollout / "results.json").read_text())
-            row[rollout] = {key: value for key, value in summary.items() if key != "per_episode"}
-        results["presets"][preset] = row
+            row[rollout] = {key: value for key, value in summary.items() if key not in ("per_episode", "policy")}
+        known[preset] = row
+    results = settings | {"presets": {preset: known[preset] for preset in PRESETS if preset in known}}
     options.document.parent.mkdir(parents=True, exist_ok=True)
     options.document.with_suffix(".json").write_text(json.dumps(results, indent=1))
     options.document.with_suffix(".md").write_text(markdown(results))
