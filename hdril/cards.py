@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from huggingface_hub import EvalResult, ModelCard
-from lerobot_policy_hdril.card import CITATION, EVALUATION
+from lerobot_policy_hdril.card import CITATION, EVALUATION, table
 
 from hdril.recording import RECIPE_PATH, features, read_provenance
 from hdril.report import headline
@@ -50,7 +50,7 @@ frame labelled with its movement primitive. All episodes succeed; {len(dropped)}
 ## Features
 
 {
-        _table(
+        table(
             ("feature", "shape", "numbers"),
             [
                 (f"`{key}`", tuple(feature["shape"]), ", ".join(feature["names"] or []))
@@ -67,7 +67,7 @@ Grippers go from 0 (closed) to 1 (open).
 `subtask_index` of each frame; names in `meta/subtasks.parquet`.
 
 {
-        _table(
+        table(
             ("label", "primitive", "frames an episode"),
             [
                 (label, name, sum(primitive.frames for primitive in task.primitives if primitive.name == name))
@@ -98,11 +98,6 @@ lerobot-dataset-viz --repo-id={repo_id} --episode-index=0
     return f"{str(card).rstrip()}\n{own}"
 
 
-def _table(head: tuple[str, ...], rows: list[tuple[object, ...]]) -> str:
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join([*lines, *("| " + " | ".join(map(str, row)) + " |" for row in rows)])
-
-
 def evaluation_section(summary: dict[str, Any], repo_id: str) -> str:
     """The results of an evaluation as text: rate, interval, errors, and the commands that give it."""
     task, options = summary["task"], " ".join(f"--policy.{o.removeprefix('--')}" for o in summary["overrides"])
@@ -121,7 +116,7 @@ def evaluation_section(summary: dict[str, Any], repo_id: str) -> str:
     stock = f"lerobot-eval --policy.path={repo_id} --env.type=hdril --env.task={task} --eval.n_episodes={summary['n_episodes']} "
     return f"""{headline(summary)}. {held_out} Errors are against the noise-free expert on the same seed.
 
-{_table(("task", "succeeded", "rate", "95 % interval", "position error", "angle error", "DTW"), [row])}
+{table(("task", "succeeded", "rate", "95 % interval", "position error", "angle error", "DTW"), [row])}
 
 ```
 {(command + f"--seed={summary['first_seed']} {options}").strip()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,7 +38,8 @@ def simulated_task(dataset_meta: LeRobotDatasetMetadata | None) -> str | None:
     return json.loads(path.read_text())["recipe"]["task"] if path.exists() else None
 
 
-def _table(head: tuple[str, ...], rows: list[tuple[object, ...]]) -> str:
+def table(head: tuple[str, ...], rows: Sequence[tuple[object, ...]]) -> str:
+    """Markdown."""
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     return "\n".join([*lines, *("| " + " | ".join(map(str, row)) + " |" for row in rows)])
 
@@ -94,7 +96,7 @@ hdril-eval --policy.path={repo_id} --task={task or "<task>"} --num_episodes=100
 ## Inputs and outputs
 
 {
-        _table(
+        table(
             ("feature", "shape", "numbers"),
             [
                 (f"`{key}`", tuple(feature.shape), ", ".join(numbers))
@@ -103,13 +105,13 @@ hdril-eval --policy.path={repo_id} --task={task or "<task>"} --num_episodes=100
         )
     }
 
-{_table(("primitive", "frames"), list(zip(config.primitives, lengths, strict=True)))}
+{table(("primitive", "frames"), list(zip(config.primitives, lengths, strict=True)))}
 
 ## Training
 
-{_table(("", ""), learned)}
+{table(("", ""), learned)}
 
-{_table(("option", "value"), choices)}
+{table(("option", "value"), choices)}
 
 {EVALUATION}
 

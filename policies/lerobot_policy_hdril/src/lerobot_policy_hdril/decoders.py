@@ -38,10 +38,10 @@ class GRUDecoder(nn.Module):
     def forward(self, latent: Tensor, steps: Tensor, stacked: bool = False) -> Tensor:
         """Latent (B, H) and step numbers (B, M) to hidden states (B, M, H); ``stacked`` under vmap."""
         if stacked:
-            gru, hidden, path = self.gru, latent, []
-            gates = nn.functional.linear(self.step(steps), gru.weight_ih_l0, gru.bias_ih_l0)
-            for gate in gates.unbind(1):
-                hidden = gru_step(gate, hidden, gru.weight_hh_l0, gru.bias_hh_l0)
+            weight_ih, weight_hh, bias_ih, bias_hh = self.gru.all_weights[0]
+            hidden, path = latent, []
+            for gates in nn.functional.linear(self.step(steps), weight_ih, bias_ih).unbind(1):
+                hidden = gru_step(gates, hidden, weight_hh, bias_hh)
                 path.append(hidden)
             return torch.stack(path, dim=1)
         hidden, _ = self.gru(self.step(steps), latent[None].contiguous())
