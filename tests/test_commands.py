@@ -128,6 +128,8 @@ def test_lerobots_own_policies_train_and_evaluate(policy: str, options: list, da
         (["hdril-record", "--repo_id=a/b", "--task=chess"], "unknown task 'chess'; choose from: "),
         (["hdril-record", "--repo-id=a/b", "--num-episodes=0"], "num_episodes must be at least 1, got 0"),
         (["hdril-record", "--repo_id=nameless"], "repo_id must look like user/name, got 'nameless'"),
+        (["hdril-record", "--repo_id=nameless", "--push"], "repo_id must look like user/name, got 'nameless'"),
+        (["hdril-eval", "--policy.path=x/y", "--push=nameless"], "push must look like user/name, got 'nameless'"),
         (["hdril-record", "--repo_id=a/b", "--noise.waypoint=1"], "noise.waypoint must be from 0 to 0.02 m"),
         (["hdril-record", "--repo_id=a/b", "--colour=red"], "--colour"),
         (["hdril-eval", "--policy.path=no/such/place"], "no checkpoint at no/such/place"),
@@ -147,10 +149,13 @@ def test_refusals_are_one_line(arguments: list[str], message: str, tmp_path: Pat
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("command", ["hdril-record", "hdril-eval", "hdril-bench"])
-def test_help(command: str) -> None:
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [("hdril-record", "--task"), ("hdril-eval", "--task"), ("hdril-bench", "--task"), ("hdril-view", "--against")],
+)
+def test_help(command: str, option: str) -> None:
     text = succeed(command, "--help")
-    assert "--task" in text
+    assert option in text
     assert "Traceback" not in text
 
 
