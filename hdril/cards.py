@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ def dataset_card(repo_id: str, root: Path) -> str:
         raise ValueError(f"{root} was not recorded by hdril: it has no {RECIPE_PATH}")
     metadata = LeRobotDatasetMetadata(repo_id, root=root)
     task, recipe = get_task(provenance.recipe.task), provenance.recipe
+    noise = " ".join(f"--noise.{name}={value}" for name, value in asdict(recipe.noise).items())
     dropped = json.loads((root / RECIPE_PATH).read_text())["dropped"]
     description = f"""Scripted demonstrations of the task `{recipe.task}` ({task.description}) with two arms of a simulated
 {recipe.robot.capitalize()}: {metadata.total_episodes} episodes, {metadata.total_frames} frames at {metadata.fps} Hz, each
@@ -88,9 +90,8 @@ Each episode can be made again from its seed ({min(provenance.seeds)} to {max(pr
 ## Use
 
 ```
-hdril-record --task={recipe.task} --repo_id={repo_id} --num_episodes={metadata.total_episodes} --seed={
-        min(provenance.seeds)
-    }
+hdril-record --task={recipe.task} --repo_id={repo_id} \\
+  --num_episodes={metadata.total_episodes} --seed={min(provenance.seeds)} {noise}
 lerobot-train --policy.type=hdril --policy.push_to_hub=false --dataset.repo_id={repo_id}
 lerobot-dataset-viz --repo-id={repo_id} --episode-index=0
 ```
