@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -130,7 +131,8 @@ Seed by seed: `{folder_of(summary)}/results.json`.
 
 def folder_of(summary: dict[str, Any]) -> str:
     """Where the results of an evaluation lie in a model's repository."""
-    return f"eval/{base_name(summary['task'])}_{summary['first_seed']}"
+    name = re.sub(r"[^\w.=-]", "_", summary["task"])  # with its parameters, if it has any
+    return f"eval/{name}_{summary['first_seed']}"
 
 
 def with_evaluation(card: ModelCard, summary: dict[str, Any], repo_id: str) -> ModelCard:
