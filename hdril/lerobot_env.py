@@ -5,19 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import gymnasium as gym
-import numpy as np
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from hdril.control import ACTION_NAMES
 from hdril.env import BimanualEnv
-from hdril.evaluation import ReferenceCache, check_keep, judge, keeps
 from hdril.tasks import TASKS, get_task
-from hdril.trace import Move, TraceRecorder
 
 for _task in TASKS.values():
     gym.register(id=_task.gym_id, entry_point="hdril.env:BimanualEnv", kwargs={"task": _task.name})
@@ -82,7 +78,10 @@ class HDRILEnvConfig(EnvConfig):
         be known to them.
         """
         get_task(self.task or "")
-        check_keep("env.rerun", self.rerun)
+        if self.rerun != "none":
+            from hdril.evaluation import check_keep
+
+            check_keep("env.rerun", self.rerun)
         factories = [partial(make_env, self.task, self.recordings, **self.gym_kwargs)] * n_envs
         same_step = gym.vector.AutoresetMode.SAME_STEP
         if use_async_envs and n_envs > 1:
@@ -98,49 +97,8 @@ def make_env(task: str, recordings: dict[str, str], **kwargs) -> gym.Env:
 
     env: gym.Env = BimanualEnv(task, **kwargs)
     if recordings["keep"] != "none":
+        # Here and not above: LeRobot imports this module at each of its commands' start.
+        from hdril.recorded_episodes import RecordedEpisodes
+
         env = RecordedEpisodes(env, recordings["keep"], Path(recordings["folder"]))  # pyright: ignore
     return FreezeAfterEpisodeEnd(env)
-
-
-class RecordedEpisodes(gym.Wrapper):
-    """Writes episodes as Rerun recordings, judged like those of ``hdril-eval``.
-
-    Only episodes whose ``reset`` was given a seed: the expert's episode of the same seed is part of a recording.
-    """
-
-    env: BimanualEnv
-
-    def __init__(self, env: BimanualEnv, keep: str, folder: Path) -> None:
-        super().__init__(env)
-        self._keep, self._folder = keep, folder
-        self._references = ReferenceCache(BimanualEnv(env.task))
-        self._recorder: TraceRecorder | None = None
-        self._seed, self._episode = -1, -1
-
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None):
-        observation, info = self.env.reset(seed=seed, options=options)
-        self._recorder = None
-        if seed is not None:
-            self._recorder = TraceRecorder(self.env, observation, info)
-            self._seed, self._episode = seed, self._episode + 1
-        return observation, info
-
-    def step(self, action):
-        result = self.env.step(action)
-        if self._recorder is not None:
-            observation, reward, terminated, truncated, info = result
-            self._recorder.add(Move(np.array(action, np.float32)), observation, float(reward), info)
-            if terminated or truncated:
-                self._finish(bool(info["is_success"]), str(info["unmet"]))
-        return result
-
-    def _finish(self, success: bool, unmet: str) -> None:
-        recorder, self._recorder = self._recorder, None
-        if recorder is None or not keeps(self._keep, self._episode, success):
-            return
-        from hdril.rerun_log import write_recording
-
-        reference = self._references.get(self._seed)
-        trace = recorder.finish(reference.scripted)
-        outcome = judge(self.env.task_spec, self._seed, trace, reference, success, unmet)
-        write_recording(self._folder, self.env, outcome, trace, reference)

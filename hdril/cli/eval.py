@@ -139,6 +139,8 @@ def _push(config: EvalConfig, output: Path) -> None:
     files: dict[str, Path | bytes] = {
         f"{folder}/{name}": output / name for name in ("results.json", "report.md", "report.png")
     }
+    if config.output_dir is None:  # the default is another one each time
+        print(f"Publishing {output}; should that fail, add --output_dir={output} to push it without playing anew")
     text = read_text(config.push, "README.md", "model")
     if (checkpoint / "config.json").exists():
         # What LeRobot publishes of a checkpoint: no pickles.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
+import socket
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -109,8 +110,9 @@ def view_command(config: ViewConfig) -> None:
     if config.save is not None:
         print(f"Saved: {config.save}\nOpen it with: rerun {shlex.quote(str(config.save))}")
     elif config.web:
-        source = quote(f"rerun+http://{config.bind}:{config.port + 1}/proxy", safe="")
-        print(f"Open http://{config.bind}:{config.port}/?url={source}", flush=True)
+        host = socket.gethostname() if config.bind == "0.0.0.0" else config.bind
+        source = quote(f"rerun+http://{host}:{config.port + 1}/proxy", safe="")
+        print(f"Open http://{host}:{config.port}/?url={source}", flush=True)
         print(f"From another machine first: ssh -L {config.port}:127.0.0.1:{config.port} "
               f"-L {config.port + 1}:127.0.0.1:{config.port + 1} <this machine>; Ctrl-C ends it", flush=True)  # fmt: skip
         _rerun("--web-viewer", "--bind", config.bind, "--web-viewer-port", str(config.port),
