@@ -8,68 +8,30 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import shlex
-import shutil
 import subprocess
 import sys
-import time
-from dataclasses import dataclass
 from pathlib import Path
 
-
-@dataclass(frozen=True)
-class Stage:
-    """A command and the file that is there when it is done."""
-
-    title: str
-    command: tuple[str, ...]
-    result: Path
-    threads: int | None = None
-    """Threads of PyTorch; as many as it likes unless given."""
-
-    def run(self) -> float:
-        """Seconds it took; 0 if it was done before."""
-        variables = {} if self.threads is None else {"OMP_NUM_THREADS": str(self.threads)}
-        prefix = "".join(f"{name}={value} " for name, value in variables.items())
-        print(f"\n== {self.title}\n$ {prefix}{shlex.join(self.command)}", flush=True)
-        if self.result.exists():
-            print(f"done before: {self.result}")
-            return 0.0
-        start = time.monotonic()
-        program = Path(sys.executable).with_name(self.command[0])
-        subprocess.run([program, *self.command[1:]], check=True, env=os.environ | variables)
-        return time.monotonic() - start
+from stages import Stage, record_stage, train_stage
 
 
 def stages(output: Path, episodes: int, steps: int, evaluations: int) -> list[Stage]:
     """The pipeline. ``output`` is where everything goes."""
     dataset, train = output / "dataset", output / "train"
-    checkpoint = train / "checkpoints" / "last" / "pretrained_model"
+    policy = train / "checkpoints" / "last" / "pretrained_model"
     return [
-        Stage(
-            f"{episodes} demonstrations",
-            ("hdril-record", "--task=table_lift", "--repo_id=hdril/table_lift", f"--root={dataset}",
-             f"--num_episodes={episodes}"),
-            dataset / "meta" / "info.json",
-        ),
-        Stage(
-            f"training, {steps} steps",
-            ("lerobot-train", "--config_path=configs/train/table_lift.yaml", f"--dataset.root={dataset}",
-             f"--output_dir={train}", f"--steps={steps}", f"--save_freq={steps}"),
-            train / "checkpoints" / f"{steps:06d}" / "pretrained_model" / "model.safetensors",
-            threads=1,  # the matrices are small: a second thread slows them down
-        ),
+        record_stage("table_lift", "hdril/table_lift", dataset, episodes),
+        train_stage("HDR-IL", "table_lift", dataset, train, steps),
         Stage(
             "evaluation with LeRobot's own command, 10 episodes",
-            ("lerobot-eval", f"--policy.path={checkpoint}", "--env.type=hdril", "--env.task=table_lift",
+            ("lerobot-eval", f"--policy.path={policy}", "--env.type=hdril", "--env.task=table_lift",
              "--eval.n_episodes=10", "--eval.batch_size=2", "--eval.use_async_envs=true", "--seed=200000",
              f"--output_dir={output / 'lerobot-eval'}"),
             output / "lerobot-eval" / "eval_info.json",
         ),
         Stage(
             f"evaluation on {evaluations} held-out seeds, with a report and recordings",
-            ("hdril-eval", f"--policy.path={checkpoint}", "--task=table_lift", f"--num_episodes={evaluations}",
+            ("hdril-eval", f"--policy.path={policy}", "--task=table_lift", f"--num_episodes={evaluations}",
              "--rerun=2", f"--output_dir={output / 'eval'}"),
             output / "eval" / "results.json",
         ),
@@ -85,9 +47,6 @@ def main() -> None:
     options = parser.parse_args()
     seconds = {}
     for stage in stages(options.output, options.episodes, options.steps, options.evaluations):
-        # A training that was cut off before its checkpoint leaves a folder that lerobot-train refuses to reuse.
-        if stage.command[0] == "lerobot-train" and not stage.result.exists():
-            shutil.rmtree(options.output / "train", ignore_errors=True)
         try:
             seconds[stage.title] = stage.run()
         except subprocess.CalledProcessError as error:

@@ -11,15 +11,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from demo import Stage
 from lerobot_policy_hdril import HDRILConfig
 from lerobot_policy_hdril.presets import PRESETS
+from stages import Stage, checkpoint, commit, evaluation_stage, record_stage, run_chains, train_stage
 
 ROLLOUTS = ("closed_loop", "open_loop")
 
@@ -47,29 +45,19 @@ def parameters(preset: str, dataset: Path) -> dict[str, int]:
     return {part: sum(p.numel() for p in getattr(policy, part).parameters()) for part in ("dynamics", "planner")}
 
 
-def stages(preset: str, options: argparse.Namespace, dataset: Path) -> list[Stage]:
+def chain(preset: str, options: argparse.Namespace, dataset: Path) -> list[Stage]:
     """Training and the two evaluations of one preset."""
     folder = options.output / preset
-    checkpoint = folder / "train" / "checkpoints" / f"{options.steps:06d}" / "pretrained_model"
-    train = Stage(
-        f"{preset}: {options.steps} steps",
-        ("lerobot-train", f"--config_path=configs/train/{options.task}.yaml", f"--dataset.root={dataset}",
-         f"--policy.preset={preset}", f"--output_dir={folder / 'train'}", f"--steps={options.steps}",
-         f"--save_freq={options.steps}", f"--batch_size={options.batch_size}"),
-        checkpoint / "model.safetensors",
-        threads=1,
-    )  # fmt: skip
-    evaluations = [
-        Stage(
-            f"{preset}: {options.episodes} seeds, {rollout}",
-            ("hdril-eval", f"--policy.path={checkpoint}", f"--policy.rollout={rollout}", f"--task={options.task}",
-             f"--num_episodes={options.episodes}", f"--seed={options.seed}", "--rerun=none", "--workers=1",
-             f"--output_dir={folder / rollout}"),
-            folder / rollout / "results.json",
-        )
-        for rollout in ROLLOUTS
+    batch = (f"--policy.preset={preset}", f"--batch_size={options.batch_size}")
+    policy = checkpoint(folder / "train", options.steps)
+    return [
+        train_stage(preset, options.task, dataset, folder / "train", options.steps, *batch),
+        *(
+            evaluation_stage(f"{preset}, {rollout}", options.task, policy, folder / rollout, options.episodes, options.seed,
+                             f"--policy.rollout={rollout}")
+            for rollout in ROLLOUTS
+        ),
     ]  # fmt: skip
-    return [train, *evaluations]
 
 
 def markdown(results: dict[str, Any]) -> str:
@@ -146,30 +134,17 @@ def main() -> None:
     if not missing:
         print(f"{options.document.with_suffix('.json')} has them all")
         return
-    Stage(
-        "demonstrations",
-        ("hdril-record", f"--task={options.task}", "--repo_id=hdril/presets", f"--root={dataset}",
-         f"--num_episodes={1 if options.parameters else options.demonstrations}"),
-        dataset / "meta" / "info.json",
-    ).run()  # fmt: skip
+    count = 1 if options.parameters else options.demonstrations
+    record_stage(options.task, "hdril/presets", dataset, count).run()
     if options.parameters:
         for preset in options.presets:
             counts = parameters(preset, dataset)
             print(f"{preset:24} dynamics {counts['dynamics']:>10,}   planner {counts['planner']:>8,}")
         return
 
-    def run(preset: str) -> None:
-        for stage in stages(preset, options, dataset):
-            stage.run()
-
-    try:
-        with ThreadPoolExecutor(options.jobs) as pool:
-            list(pool.map(run, missing))
-    except subprocess.CalledProcessError as error:
-        sys.exit(f"presets: {error.cmd[0]} failed with exit code {error.returncode}")
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
+    run_chains([chain(preset, options, dataset) for preset in missing], options.jobs)
     for preset in missing:
-        row: dict[str, Any] = {"commit": commit.stdout.strip(), "parameters": parameters(preset, dataset)}
+        row: dict[str, Any] = {"commit": commit(), "parameters": parameters(preset, dataset)}
         for rollout in ROLLOUTS:
             summary = json.loads((options.output / preset / rollout / "results.json").read_text())
             row[rollout] = {key: value for key, value in summary.items() if key not in ("per_episode", "policy")}

@@ -7,6 +7,7 @@ which the policy uses ``index`` alone.
 
 from __future__ import annotations
 
+import gc
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -66,14 +67,34 @@ def _matrix(table, key: str) -> np.ndarray:
     return np.stack(table.column(key).to_numpy()).astype(np.float32)
 
 
+def selected_episodes(metadata: LeRobotDatasetMetadata) -> list[int] | None:
+    """Episodes that ``--dataset.episodes`` or ``--dataset.eval_split`` leave to train on; None for all.
+
+    LeRobot gives the policy the metadata of the whole dataset, and tells the choice to the ``LeRobotDataset`` alone, which
+    holds the metadata: so that is looked for among its holders.
+    """
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    holders = gc.get_referrers(metadata)
+    # A holder is the object itself, or the dictionary of its attributes where Python has made one.
+    datasets = [item for item in gc.get_referrers(*holders) + holders if isinstance(item, LeRobotDataset)]
+    chosen = [dataset.episodes for dataset in datasets if dataset.meta is metadata and dataset.episodes is not None]
+    return sorted(chosen[0]) if chosen else None
+
+
 class Demonstrations:
     """All frames of a dataset as tensors; ``state`` is observation.state and environment_state side by side.
+
+    ``episodes`` are those to learn from, None for all. The others have windows too, for a loss on held-out episodes, but
+    nothing that is fitted sees them.
 
     Raises:
         ValueError: labels that are not integers from 0 to the number of primitives - 1, or a primitive with no frames.
     """
 
-    def __init__(self, metadata: LeRobotDatasetMetadata, subtask_key: str, device: str) -> None:
+    def __init__(
+        self, metadata: LeRobotDatasetMetadata, subtask_key: str, device: str, episodes: list[int] | None = None
+    ) -> None:
         root = Path(metadata.root)
         self.primitives = read_primitives(root)
         columns = [OBS_STATE, OBS_ENV_STATE, ACTION, subtask_key, "index", "episode_index"]
@@ -83,9 +104,10 @@ class Demonstrations:
         table = parquet.ParquetDataset(files).read(columns=columns)
         table = table.take(np.argsort(table.column("index").to_numpy(), kind="stable"))
         labels = table.column(subtask_key).to_numpy()
-        self._check_labels(labels)
-        episodes = table.column("episode_index").to_numpy()
-        new_episode = np.diff(episodes, prepend=-1) != 0
+        episode_index = table.column("episode_index").to_numpy()
+        learned = np.full(len(labels), True) if episodes is None else np.isin(episode_index, episodes)
+        self._check_labels(labels, labels[learned])
+        new_episode = np.diff(episode_index, prepend=-1) != 0
         new_segment = new_episode | (np.diff(labels, prepend=-1) != 0)
         tensors = {
             "index": table.column("index").to_numpy().astype(np.int64),
@@ -94,6 +116,7 @@ class Demonstrations:
             "label": labels.astype(np.int64),
             "episode": np.cumsum(new_episode) - 1,
             "segment": np.cumsum(new_segment) - 1,
+            "learned": learned,
         }
         if not all(np.isfinite(tensors[key]).all() for key in ("state", "action")):
             raise ValueError(f"{root} holds states or actions that are not finite")
@@ -109,19 +132,20 @@ class Demonstrations:
     label: Tensor
     episode: Tensor
     segment: Tensor
+    learned: Tensor
+    """(frames,), whether the episode is one to learn from."""
 
-    def _check_labels(self, labels: np.ndarray) -> None:
+    def _check_labels(self, labels: np.ndarray, learned: np.ndarray) -> None:
         count = len(self.primitives)
         if labels.min() < 0 or labels.max() >= count:
             raise ValueError(
                 f"labels go from {labels.min()} to {labels.max()}, but {SUBTASKS_PATH} names {count}: "
                 f"{', '.join(self.primitives)}"
             )
-        missing = [name for i, name in enumerate(self.primitives) if not (labels == i).any()]
+        missing = [name for i, name in enumerate(self.primitives) if not (learned == i).any()]
         if missing:
-            raise ValueError(
-                f"no frame of the dataset is labelled {', '.join(missing)}; there is nothing to learn it from"
-            )
+            where = "the dataset" if len(learned) == len(labels) else "the dataset's chosen episodes"
+            raise ValueError(f"no frame of {where} is labelled {', '.join(missing)}; there is nothing to learn it from")
 
     @staticmethod
     def _bounds(starts: np.ndarray, device: str) -> Tensor:
@@ -129,22 +153,17 @@ class Demonstrations:
         return torch.from_numpy(np.stack([first, np.append(first[1:], len(starts))], axis=1)).to(device)
 
     def _lengths(self) -> list[list[int]]:
-        bounds = self._segment_bounds
+        bounds = self._segment_bounds[self.learned[self._segment_bounds[:, 0]]]
         lengths, labels = bounds[:, 1] - bounds[:, 0], self.label[bounds[:, 0]]
         runs = [lengths[labels == k] for k in range(len(self.primitives))]
         return [[int(run.min()), int(run.max())] for run in runs]
 
-    @property
-    def segment_starts(self) -> Tensor:
-        """Rows (segments,) at which a primitive begins."""
-        return self._segment_bounds[:, 0]
-
     def look_rows(self, stride: int) -> Tensor:
-        """Rows at which a rollout looks: every ``stride`` frames of a primitive, or at its start alone if it is 0."""
-        if not stride:
-            return self.segment_starts
-        rows = torch.arange(len(self.segment), device=self.segment.device)
-        return rows[(rows - self._segment_bounds[self.segment, 0]) % stride == 0]
+        """Rows to learn from at which a rollout looks: every ``stride`` frames of a primitive, or at its start alone if it
+        is 0."""
+        rows = self.learned.nonzero().squeeze(-1)
+        elapsed = rows - self._segment_bounds[self.segment[rows], 0]
+        return rows[(elapsed % stride if stride else elapsed) == 0]
 
     def rows(self, index: Tensor) -> Tensor:
         """Rows of the frames with these values of ``index`` (B,)."""

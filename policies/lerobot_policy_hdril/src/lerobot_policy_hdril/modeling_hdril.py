@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from lerobot_policy_hdril.card import model_card
 from lerobot_policy_hdril.configuration_hdril import HDRILConfig
 from lerobot_policy_hdril.coordinates import RelationalCoordinates
-from lerobot_policy_hdril.demonstrations import Demonstrations, History, Window
+from lerobot_policy_hdril.demonstrations import Demonstrations, History, Window, selected_episodes
 from lerobot_policy_hdril.dynamics import PrimitiveDynamics, predict_stacked
 from lerobot_policy_hdril.graph import group_nodes, quaternion_groups
 from lerobot_policy_hdril.planner import Planner
@@ -80,8 +80,8 @@ class HDRILPolicy(PreTrainedPolicy):
 
     Args:
         config: see :class:`HDRILConfig`.
-        dataset_stats: statistics of the dataset (LeRobot gives them when it trains); needed for a new model.
-        dataset_meta: the dataset to train on, given likewise. Without it, :meth:`forward` cannot run.
+        dataset_meta: the dataset to train on (LeRobot gives it when it trains). Without it, :meth:`forward` cannot run. Of
+            a ``LeRobotDataset`` with chosen episodes, these alone decide normalisation, lengths and linear maps.
 
     Raises:
         ValueError: no dataset and nothing learned before, or a dataset that does not fit.
@@ -93,7 +93,6 @@ class HDRILPolicy(PreTrainedPolicy):
     def __init__(
         self,
         config: HDRILConfig,
-        dataset_stats: dict[str, dict[str, Any]] | None = None,
         dataset_meta: LeRobotDatasetMetadata | None = None,
         **kwargs: Any,
     ) -> None:
@@ -103,7 +102,8 @@ class HDRILPolicy(PreTrainedPolicy):
         self._demonstrations: Demonstrations | None = None
         if dataset_meta is not None:
             config.set_dataset_feature_metadata(dataset_meta.features)
-            self._demonstrations = Demonstrations(dataset_meta, config.subtask_key, config.device or "cpu")
+            chosen = selected_episodes(dataset_meta)
+            self._demonstrations = Demonstrations(dataset_meta, config.subtask_key, config.device or "cpu", chosen)
             config.learn_primitives(self._demonstrations.primitives, self._demonstrations.lengths)
             config.learn_replanning()
         if not config.primitives:
@@ -111,11 +111,8 @@ class HDRILPolicy(PreTrainedPolicy):
                 "hdril learns its primitives from a dataset: train it with lerobot-train, or load a checkpoint"
             )
         self._build()
-        if dataset_stats is not None:
-            self._set_normalisation(dataset_stats)
         if self._demonstrations is not None:
-            if self.relational is not None:
-                self._set_relational_normalisation(self._demonstrations)
+            self._fit_normalisation(self._demonstrations)
             if config.state_skip:
                 self._fit_state_skips(self._demonstrations)
         self.reset()
@@ -168,28 +165,17 @@ class HDRILPolicy(PreTrainedPolicy):
     longest_length: Tensor
     loss_weights: Tensor
 
-    def _set_normalisation(self, stats: dict[str, dict[str, Any]]) -> None:
-        def gather(keys: tuple[str, ...], statistic: str) -> Tensor:
-            missing = [key for key in keys if statistic not in stats.get(key, {})]
-            if missing:
-                raise ValueError(f"the dataset's stats have no {statistic} of {', '.join(missing)}")
-            return torch.cat([torch.as_tensor(stats[key][statistic], dtype=torch.float32).flatten() for key in keys])
-
-        state, output = (OBS_STATE, OBS_ENV_STATE), ("action", OBS_STATE, OBS_ENV_STATE)
-        for name, keys in (("state", state), ("output", output)):
-            getattr(self, f"{name}_mean").copy_(gather(keys, "mean"))
-            getattr(self, f"{name}_std").copy_(gather(keys, "std").clamp_min(self.config.min_std))
-
     @torch.no_grad()
-    def _set_relational_normalisation(self, demonstrations: Demonstrations) -> None:
-        """LeRobot's statistics are of absolute poses; these are of what the model sees, over the same data."""
-        assert self.relational is not None
-        window = demonstrations.window(demonstrations.segment_starts, 0, self.longest)
-        seen = self.relational.encode_state(demonstrations.state)
-        told = self.relational.encode_output(window.target, window.state)[window.mask]
-        for name, values in (("state", seen), ("output", told)):
+    def _fit_normalisation(self, demonstrations: Demonstrations) -> None:
+        """Mean and deviation of what the models see and predict. LeRobot's statistics are of all episodes, also of those
+        that are held out, and of absolute poses."""
+        window = demonstrations.window(demonstrations.look_rows(0), 0, self.longest)
+        seen, told = demonstrations.state[demonstrations.learned], window.target
+        if self.relational is not None:
+            seen, told = self.relational.encode_state(seen), self.relational.encode_output(told, window.state)
+        for name, values in (("state", seen), ("output", told[window.mask])):
             getattr(self, f"{name}_mean").copy_(values.mean(0))
-            getattr(self, f"{name}_std").copy_(values.std(0).clamp_min(self.config.min_std))
+            getattr(self, f"{name}_std").copy_(values.std(0, correction=0).clamp_min(self.config.min_std))
 
     def _fit_state_skips(self, demonstrations: Demonstrations) -> None:
         """Solve the linear maps on all windows that training can draw."""
