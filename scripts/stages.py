@@ -76,13 +76,13 @@ def train_stage(
 
 
 def evaluation_stage(
-    title: str, task: str, policy: Path, output: Path, episodes: int, seed: int, *options: str
+    title: str, task: str, policy: Path, output: Path, episodes: int, seed: int, *options: str, workers: int = 1
 ) -> Stage:
     """``hdril-eval`` on ``episodes`` seeds from ``seed`` on; it goes on by itself where it was cut off."""
     return Stage(
         f"{title}: {episodes} seeds",
         ("hdril-eval", f"--policy.path={policy}", f"--task={task}", f"--num_episodes={episodes}", f"--seed={seed}",
-         "--rerun=none", "--workers=1", f"--output_dir={output}", *options),
+         "--rerun=none", f"--workers={workers}", f"--output_dir={output}", *options),
         output / "results.json",
     )  # fmt: skip
 

@@ -1,0 +1,302 @@
+"""How long, from how much, and with which latent HDR-IL learns a task.
+
+python scripts/learning.py     trains and evaluates what is missing, then writes docs/learning.md, .json and .png
+
+Four questions, each with stock ``lerobot-train`` and held-out seeds: success after so many minutes of training; success of
+the last checkpoint on many seeds; success from few demonstrations, on disjoint choices of them; and the latent
+(deterministic, variational, sampled), on seeds of its own, because its answer chooses a default.
+What is done is skipped: after Ctrl-C the same command goes on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+from stages import Stage, checkpoint, commit, evaluation_stage, record_stage, run_chains, train_stage
+
+from hdril.statistics import wilson_interval
+
+CURVE_STRIDE = 100
+CURVE_STEPS = (100, 200, 300, 500, 700, 1000, 1500, 2000, 2500)
+
+# Options of training and of evaluation. What is evaluated twice is trained once.
+LATENTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "deterministic": (("--policy.latent=deterministic",), ()),
+    "variational, KL weight 0, mean": (("--policy.latent=variational",), ()),
+    "variational, KL weight 0, 5 samples": (("--policy.latent=variational",), ("--policy.samples=5",)),
+    "variational, KL weight 0.001, mean": (("--policy.latent=variational", "--policy.kl_weight=0.001"), ()),
+    "variational, KL weight 0.001, 5 samples": (
+        ("--policy.latent=variational", "--policy.kl_weight=0.001"),
+        ("--policy.samples=5",),
+    ),
+}
+
+
+def subset(size: int, number: int) -> str:
+    """The option that trains on the ``number``-th ``size`` demonstrations."""
+    return f"--dataset.episodes={list(range(number * size, (number + 1) * size))}"
+
+
+class Report:
+    """Where everything of a run lies, the stages that make it, and what they found."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.options = options
+        self.dataset = options.output / "dataset"
+        self.curve = options.output / "curve"
+        self.started = self.curve / "started.json"
+        self.steps = sorted({step for step in CURVE_STEPS if step < options.steps} | {options.steps})
+
+    def train_curve(self) -> None:
+        """Train with all demonstrations, alone on the machine, and remember when it began."""
+        stage = train_stage("all demonstrations", self.options.task, self.dataset, self.curve / "train",
+                            self.options.steps, save_every=CURVE_STRIDE)  # fmt: skip
+        if not stage.result.exists():
+            self.curve.mkdir(parents=True, exist_ok=True)
+            self.started.write_text(json.dumps({"time": time.time(), "cores": os.cpu_count()}))
+        stage.run()
+
+    def _evaluate(self, title: str, policy: Path, output: Path, seed: int, *options: str) -> Stage:
+        return evaluation_stage(title, self.options.task, policy, output, self.options.episodes, seed, *options)
+
+    def few_train(self, size: int, number: int) -> Stage:
+        """Training on few demonstrations, with the default latent."""
+        return train_stage(f"{size} demonstrations, choice {number}", self.options.task, self.dataset,
+                           self.few(size, number) / "train", self.options.few_steps, subset(size, number))  # fmt: skip
+
+    def few(self, size: int, number: int) -> Path:
+        return self.options.output / f"few_{size}_{number}"
+
+    def latent(self, name: str, number: int | None) -> tuple[Path, Path]:
+        """Folders of training and evaluation. ``number``: the choice of few demonstrations; None: all of them."""
+        options = self.options
+        base = self.curve if number is None else self.few(options.few[0], number)
+        training, evaluating = LATENTS[name]
+        if name != "deterministic":
+            base = base.with_name(base.name + "".join(option.split(".", 1)[1].replace("=", "_") for option in training))
+        return base / "train", base / ("latent_sampled" if evaluating else "latent")
+
+    def chains(self) -> list[list[Stage]]:
+        """All but :meth:`train_curve`."""
+        options, seed = self.options, self.options.seed
+        after = [
+            [
+                self._evaluate(
+                    f"after {step} steps", checkpoint(self.curve / "train", step), self.curve / f"{step}", seed
+                )
+            ]
+            for step in self.steps
+        ]
+        trained: dict[Path, list[Stage]] = {}  # what needs a training follows it in its chain
+        for size in options.few:
+            for number in range(options.choices):
+                train, folder = self.few_train(size, number), self.few(size, number)
+                trained[folder / "train"] = [
+                    train,
+                    self._evaluate(train.title, train.result.parent, folder / "eval", seed),
+                ]
+        for number in (None, *range(options.choices)):
+            for name, (training, evaluating) in LATENTS.items():
+                train, output = self.latent(name, number)
+                title = f"{name}, {'all' if number is None else f'choice {number}'}"
+                steps = options.steps if number is None else options.few_steps
+                if train not in trained:
+                    choice = () if number is None else (subset(options.few[0], number),)
+                    trained[train] = [train_stage(title, options.task, self.dataset, train, steps, *choice, *training)]
+                trained[train].append(
+                    self._evaluate(title, checkpoint(train, steps), output, options.latent_seed, *evaluating)
+                )
+        return [*after, *trained.values()]
+
+    def final(self) -> Stage:
+        """The last checkpoint on many seeds, with all cores."""
+        options = self.options
+        return evaluation_stage("the last checkpoint", options.task, checkpoint(self.curve / "train", options.steps),
+                                options.output / "final", options.held_out, options.held_out_seed,
+                                workers=options.jobs)  # fmt: skip
+
+    def minutes(self, steps: int) -> float:
+        """From the start of the command until the checkpoint was there."""
+        saved = (checkpoint(self.curve / "train", steps) / "model.safetensors").stat().st_mtime
+        return (saved - json.loads(self.started.read_text())["time"]) / 60.0
+
+    def results(self) -> dict[str, Any]:
+        """Everything that was found, as plain data."""
+        options = self.options
+        few = {
+            str(size): [_summary(self.few(size, number) / "eval") for number in range(options.choices)]
+            for size in options.few
+        }
+        latents = {
+            name: {
+                "all": _summary(self.latent(name, None)[1]),
+                "few": [_summary(self.latent(name, number)[1]) for number in range(options.choices)],
+            }
+            for name in LATENTS
+        }
+        settings = {key: value for key, value in vars(options).items() if key not in ("output", "document", "jobs")}
+        return settings | {
+            "commit": commit(),
+            "cores": json.loads(self.started.read_text())["cores"],
+            "curve": [
+                {"steps": step, "minutes": self.minutes(step)} | _summary(self.curve / f"{step}") for step in self.steps
+            ],
+            "final": _summary(options.output / "final"),
+            "few_shot": few,
+            "latent": latents,
+        }
+
+
+def _summary(folder: Path) -> dict[str, Any]:
+    summary = json.loads((folder / "results.json").read_text())
+    keys = (
+        "first_seed",
+        "n_episodes",
+        "n_success",
+        "pc_success",
+        "pc_success_ci95",
+        "position_error_cm",
+        "stages_reached",
+    )
+    return {key: summary[key] for key in keys} | {"planner_pc_correct": summary["planner"]["pc_correct"]}
+
+
+def _row(cells: list[Any]) -> str:
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def _table(header: list[str], rows: list[list[Any]]) -> list[str]:
+    return [_row(header), "|" + "---|" * len(header), *map(_row, rows), ""]
+
+
+def _rate(summaries: list[dict[str, Any]]) -> str:
+    """Success of all episodes together: "n of m (low to high %)"."""
+    successes, trials = (sum(summary[key] for summary in summaries) for key in ("n_success", "n_episodes"))
+    low, high = wilson_interval(successes, trials)
+    return f"{successes} of {trials} ({100 * low:.1f} to {100 * high:.1f} %)"
+
+
+def _error(summaries: list[dict[str, Any]]) -> str:
+    mean = sum(summary["position_error_cm"]["mean"] for summary in summaries) / len(summaries)
+    return f"{mean:.2f}"
+
+
+def markdown(found: dict[str, Any], picture: str) -> str:
+    """The report."""
+    reached = next(
+        (point for i, point in enumerate(found["curve"]) if all(p["pc_success"] >= 99.0 for p in found["curve"][i:])),
+        None,
+    )
+    until = f"99 % is reached after {reached['minutes']:.1f} minutes, and kept" if reached else "99 % is not reached"
+    small = found["few"][0]
+    return "\n".join(
+        [
+            f"# How HDR-IL learns {found['task']}",
+            "",
+            f"Made by `python scripts/learning.py` on commit {found['commit']}, on {found['cores']} cores and no GPU. Closed "
+            "loop, planner included, held-out seeds, 95 % intervals; the position error is the distance of the hands from the "
+            "expert's on the same seed, mean over episodes.",
+            "",
+            "## Minutes",
+            "",
+            f"`OMP_NUM_THREADS=1 lerobot-train --config_path=configs/train/{found['task']}.yaml` on {found['demonstrations']} "
+            f"demonstrations, alone on the machine; minutes from the start of the command, imports included, to the checkpoint. "
+            f"Seeds from {found['seed']} on. {until}.",
+            "",
+            f"![Success over minutes of training]({picture})",
+            "",
+            *_table(
+                ["steps", "minutes", "success", "position error, cm", "planner right, % of frames"],
+                [[point["steps"], f"{point['minutes']:.1f}", _rate([point]), _error([point]),
+                  f"{point['planner_pc_correct']:.1f}"] for point in found["curve"]],
+            ),
+            f"The last checkpoint on seeds from {found['held_out_seed']} on: **{_rate([found['final']])}**, "
+            f"{_error([found['final']])} cm.",
+            "",
+            "## Demonstrations",
+            "",
+            f"{found['few_steps']:,} steps on disjoint choices of the demonstrations (`--dataset.episodes`); the same seeds.",
+            "",
+            *_table(
+                ["demonstrations", *(f"choice {i}" for i in range(found["choices"])), "together", "position error, cm"],
+                [[size, *(_rate([one]) for one in runs), _rate(runs), _error(runs)]
+                 for size, runs in found["few_shot"].items()],
+            ),
+            "## The latent",
+            "",
+            f"With all demonstrations ({found['steps']:,} steps) and with {small} ({found['few_steps']:,} steps, "
+            f"{found['choices']} choices), on seeds from {found['latent_seed']} on, which nothing else here uses.",
+            "",
+            *_table(
+                ["latent", "all: success", "position error, cm", f"{small}: success", "position error, cm"],
+                [[name, _rate([runs["all"]]), _error([runs["all"]]), _rate(runs["few"]), _error(runs["few"])]
+                 for name, runs in found["latent"].items()],
+            ),
+        ]
+    )  # fmt: skip
+
+
+def draw(found: dict[str, Any], path: Path) -> None:
+    """Success with its interval, and the position error, over minutes."""
+    curve = found["curve"]
+    minutes = [point["minutes"] for point in curve]
+    figure, (success, error) = plt.subplots(1, 2, figsize=(9, 3), constrained_layout=True)
+    success.fill_between(minutes, *zip(*(point["pc_success_ci95"] for point in curve), strict=True), alpha=0.25)
+    success.plot(minutes, [point["pc_success"] for point in curve], marker="o")
+    success.axhline(99.0, color="grey", linewidth=0.8, linestyle="--")
+    success.set(xlabel="minutes of training", ylabel="success, %", ylim=(0, 101), xlim=(0, None))
+    error.plot(minutes, [point["position_error_cm"]["mean"] for point in curve], marker="o")
+    error.set(xlabel="minutes of training", ylabel="position error, cm", ylim=(0, None), xlim=(0, None))
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", default="table_lift")
+    parser.add_argument("--demonstrations", type=int, default=500)
+    parser.add_argument("--steps", type=int, default=3000, help="of training on all demonstrations, a multiple of 100")
+    parser.add_argument("--episodes", type=int, default=200, help="seeds of each evaluation but the last")
+    parser.add_argument("--seed", type=int, default=400_000)
+    parser.add_argument("--held-out", type=int, default=1000, help="seeds for the last checkpoint")
+    parser.add_argument("--held-out-seed", type=int, default=100_000)
+    parser.add_argument("--latent-seed", type=int, default=500_000)
+    parser.add_argument(
+        "--few", type=int, nargs="+", default=[10, 50], help="numbers of demonstrations; the latents use the first"
+    )
+    parser.add_argument("--few-steps", type=int, default=1000)
+    parser.add_argument("--choices", type=int, default=3, help="disjoint choices of few demonstrations")
+    parser.add_argument("--jobs", type=int, default=2, help="commands at a time")
+    parser.add_argument("--output", type=Path, default=Path("outputs/learning"))
+    parser.add_argument(
+        "--document", type=Path, default=Path("docs/learning"), help="where the report goes, without suffix"
+    )
+    options = parser.parse_args()
+    if options.steps % CURVE_STRIDE:
+        parser.error(f"--steps must be a multiple of {CURVE_STRIDE}, got {options.steps}")
+    if max(options.few) * options.choices > options.demonstrations:
+        parser.error(
+            f"--choices={options.choices} of {max(options.few)} need more than {options.demonstrations} demonstrations"
+        )
+    report = Report(options)
+    record_stage(options.task, "hdril/learning", report.dataset, options.demonstrations).run()
+    report.train_curve()
+    run_chains(report.chains(), options.jobs)
+    run_chains([[report.final()]], 1)
+    found = report.results()
+    options.document.parent.mkdir(parents=True, exist_ok=True)
+    options.document.with_suffix(".json").write_text(json.dumps(found, indent=1))
+    picture = options.document.with_suffix(".png")
+    draw(found, picture)
+    options.document.with_suffix(".md").write_text(markdown(found, picture.name))
+    print(options.document.with_suffix(".md").read_text())
+
+
+if __name__ == "__main__":
+    main()
