@@ -14,6 +14,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 import torch
+from lerobot.common.train_utils import load_training_state, save_training_state
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import make_policy
@@ -79,6 +80,40 @@ def test_variant_learns_saves_loads_and_runs(variant: str, metadata, tmp_path: P
             torch.testing.assert_close(together[:, group].norm(dim=-1), torch.ones(3))
     assert policy.rollout is not None
     torch.testing.assert_close(policy.rollout.probabilities.sum(-1), torch.ones(3))
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_variant_resumes(variant: str, metadata, tmp_path: Path) -> None:
+    """Four steps, and two, a checkpoint as LeRobot's trainer writes and reads it, and two: the same weights, bit for bit."""
+
+    def prepare(policy: HDRILPolicy):
+        policy.train()
+        optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+        return policy, optimizer, policy.config.get_scheduler_preset().build(optimizer, 4)
+
+    def train(policy: HDRILPolicy, optimizer, scheduler) -> None:
+        for _ in range(2):
+            policy.forward({"index": torch.arange(0, 420, 9)})[0].backward()
+            optimizer.step()
+            optimizer.zero_grad()
+            scheduler.step()
+
+    straight = prepare(build(metadata, **VARIANTS[variant]))
+    train(*straight)
+    straight[0].save_pretrained(tmp_path / "pretrained_model")
+    save_training_state(tmp_path, 2, *straight[1:])
+    saved = {name: value.clone() for name, value in straight[0].state_dict().items()}
+    train(*straight)
+    torch.manual_seed(7)
+    config = HDRILConfig.from_pretrained(tmp_path / "pretrained_model")
+    config.pretrained_path = tmp_path / "pretrained_model"
+    resumed = prepare(make_policy(config, ds_meta=metadata))
+    for name, value in resumed[0].state_dict().items():
+        torch.testing.assert_close(value, saved[name], atol=0, rtol=0)
+    assert load_training_state(tmp_path, *resumed[1:])[0] == 2
+    train(*resumed)
+    for name, value in resumed[0].state_dict().items():
+        torch.testing.assert_close(value, straight[0].state_dict()[name], atol=0, rtol=0)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -289,6 +324,19 @@ def test_episodes_that_are_left_out_are_not_learned_from(copy: Path) -> None:
     for old, values in zip(before, ({}, {"coordinates": "relational"}), strict=True):
         torch.testing.assert_close(fitted(values), old, atol=0, rtol=0)
     assert not torch.equal(everywhere()["dynamics.0.state_skip.bias"], whole["dynamics.0.state_skip.bias"])
+
+
+def test_planner_sees_the_world_whatever_the_dynamics_see(metadata) -> None:
+    absolute, relational = (build(metadata, coordinates=name).eval() for name in ("absolute", "relational"))
+    relational.planner.load_state_dict(absolute.planner.state_dict())
+    for t in range(5):
+        seen = observation(metadata, [t, 70 + t])
+        actions = [policy.select_action(seen) for policy in (absolute, relational)]
+        assert not torch.equal(*actions)
+        assert absolute.rollout is not None
+        assert relational.rollout is not None
+        torch.testing.assert_close(relational.rollout.probabilities, absolute.rollout.probabilities, atol=0, rtol=0)
+        torch.testing.assert_close(relational.attention().planner, absolute.attention().planner, atol=0, rtol=0)
 
 
 def test_primitives_follow_the_planner_at_boundaries(metadata) -> None:

@@ -50,7 +50,8 @@ class HDRILConfig(PreTrainedConfig):
     """One dynamics model per primitive (the paper's Multi), or one for all that is told the primitive."""
     decoder: Decoder = "gru"
     coordinates: Coordinates = "absolute"
-    """``relational``: hands and predictions in the frame of the first object, as it stands when a plan is made."""
+    """Of the dynamics. ``relational``: hands and predictions in the frame of the first object, as it stands when a plan is
+    made. The planner always sees the world's."""
     latent: Latent = "deterministic"
     """``variational``: a Gaussian, sampled in training (paper, Figure 2)."""
     kl_weight: float = 0.0

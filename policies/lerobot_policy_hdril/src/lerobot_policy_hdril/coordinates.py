@@ -49,7 +49,12 @@ class RelationalCoordinates(nn.Module):
         inputs = [group for group in pose_groups(state_names) if group != frames[0]]
         for name, value in (("frame", frames[0]), ("inputs", inputs), ("outputs", pose_groups(output_names))):
             self.register_buffer(name, torch.tensor(value, dtype=torch.long), persistent=False)
+        # Of encoded states, over the demonstrations.
+        self.register_buffer("state_mean", torch.zeros(len(state_names)))
+        self.register_buffer("state_std", torch.ones(len(state_names)))
 
+    state_mean: Tensor
+    state_std: Tensor
     frame: Tensor
     inputs: Tensor
     outputs: Tensor

@@ -170,18 +170,25 @@ class HDRILPolicy(PreTrainedPolicy):
         """Mean and deviation of what the models see and predict. LeRobot's statistics are of all episodes, also of those
         that are held out, and of absolute poses."""
         window = demonstrations.window(demonstrations.look_rows(0), 0, self.longest)
-        seen, told = demonstrations.state[demonstrations.learned], window.target
+        state, output = demonstrations.state[demonstrations.learned], window.target
+        parts = [(self, "state", state)]
         if self.relational is not None:
-            seen, told = self.relational.encode_state(seen), self.relational.encode_output(told, window.state)
-        for name, values in (("state", seen), ("output", told[window.mask])):
-            getattr(self, f"{name}_mean").copy_(values.mean(0))
-            getattr(self, f"{name}_std").copy_(values.std(0, correction=0).clamp_min(self.config.min_std))
+            parts.append((self.relational, "state", self.relational.encode_state(state)))
+            output = self.relational.encode_output(output, window.state)
+        parts.append((self, "output", output[window.mask]))
+        for owner, name, values in parts:
+            getattr(owner, f"{name}_mean").copy_(values.mean(0))
+            getattr(owner, f"{name}_std").copy_(values.std(0, correction=0).clamp_min(self.config.min_std))
 
     def _fit_state_skips(self, demonstrations: Demonstrations) -> None:
         """Solve the linear maps on all windows that training can draw."""
         window = demonstrations.window(demonstrations.look_rows(self.config.trained_replan_every),
                                        self.config.trained_replan_every, self.longest)  # fmt: skip
-        normalised, target, steps = self._normalise(window.state), self._target(window), self._steps(window.elapsed)
+        normalised, target, steps = (
+            self._dynamics_input(window.state),
+            self._target(window),
+            self._steps(window.elapsed),
+        )
         for k, model in enumerate(self.dynamics):
             mine = window.primitive == k if self.config.per_primitive else torch.ones_like(window.primitive).bool()
             model.state_skip.fit(normalised[mine], steps[mine], target[mine], window.mask[mine], self.config.ridge)  # pyright: ignore
@@ -251,14 +258,20 @@ class HDRILPolicy(PreTrainedPolicy):
         return loss, hits.float().mean().item()
 
     def _normalise(self, state: Tensor) -> Tensor:
-        if self.relational is not None:
-            state = self.relational.encode_state(state)
+        """What the planner sees: always the world's coordinates. Hands that hold an object do not move in its frame; what
+        they are beside the demonstrations there, in millimetres, is many deviations, and misleads it."""
         return (state - self.state_mean) / self.state_std
+
+    def _dynamics_input(self, state: Tensor) -> Tensor:
+        """What the dynamics see of states (..., S)."""
+        if self.relational is None:
+            return self._normalise(state)
+        return (self.relational.encode_state(state) - self.relational.state_mean) / self.relational.state_std
 
     def _predict(self, state: Tensor, primitive: Tensor, elapsed: Tensor) -> tuple[Tensor, Tensor]:
         """Normalised actions and states (B, M, A + S), and divergence of the latent (B,), nats, from raw states (B, S),
         ``elapsed`` (B,) frames into primitives."""
-        normalised, samples = self._normalise(state), self.config.samples
+        normalised, samples = self._dynamics_input(state), self.config.samples
         steps = self._steps(elapsed)
         if not self.config.per_primitive:
             context = F.one_hot(primitive, len(self.config.primitives)).to(state.dtype)
@@ -317,15 +330,15 @@ class HDRILPolicy(PreTrainedPolicy):
         if self._rollout is None:
             raise RuntimeError("no episode is running: attention is read after an action")
         seen, playing = self._rollout.seen, self._rollout.primitive.tolist()
-        normalised = self._normalise(seen)
+        given = self._dynamics_input(seen)
         rows = [
-            self.dynamics[k if self.config.per_primitive else 0].graph.attention(normalised[i : i + 1], seen[i : i + 1])
+            self.dynamics[k if self.config.per_primitive else 0].graph.attention(given[i : i + 1], seen[i : i + 1])
             for i, k in enumerate(playing)
         ]
         return Attention(
             nodes=list(self.planner.graph.node_names),
             primitives=[self.config.primitives[k] for k in playing],
-            planner=self.planner.graph.attention(normalised, seen),
+            planner=self.planner.graph.attention(self._normalise(seen), seen),
             dynamics=torch.cat(rows),
         )
 
