@@ -62,8 +62,9 @@ class Report:
             self.started.write_text(json.dumps({"time": time.time(), "cores": os.cpu_count()}))
         stage.run()
 
-    def _evaluate(self, title: str, policy: Path, output: Path, seed: int, *options: str) -> Stage:
-        return evaluation_stage(title, self.options.task, policy, output, self.options.episodes, seed, *options)
+    def _evaluate(self, title: str, policy: Path, output: Path) -> Stage:
+        options = self.options
+        return evaluation_stage(title, options.task, policy, output, options.episodes, options.seed)
 
     def few_train(self, size: int, number: int) -> Stage:
         """Training on few demonstrations, with the default latent."""
@@ -83,14 +84,10 @@ class Report:
         return base / "train", base / ("latent_sampled" if evaluating else "latent")
 
     def chains(self) -> list[list[Stage]]:
-        """All but :meth:`train_curve`."""
-        options, seed = self.options, self.options.seed
+        """All but :meth:`train_curve` and :meth:`final`."""
+        options = self.options
         after = [
-            [
-                self._evaluate(
-                    f"after {step} steps", checkpoint(self.curve / "train", step), self.curve / f"{step}", seed
-                )
-            ]
+            [self._evaluate(f"after {step} steps", checkpoint(self.curve / "train", step), self.curve / f"{step}")]
             for step in self.steps
         ]
         trained: dict[Path, list[Stage]] = {}  # what needs a training follows it in its chain
@@ -99,7 +96,7 @@ class Report:
                 train, folder = self.few_train(size, number), self.few(size, number)
                 trained[folder / "train"] = [
                     train,
-                    self._evaluate(train.title, train.result.parent, folder / "eval", seed),
+                    self._evaluate(train.title, train.result.parent, folder / "eval"),
                 ]
         for number in (None, *range(options.choices)):
             for name, (training, evaluating) in LATENTS.items():
@@ -110,8 +107,9 @@ class Report:
                     choice = () if number is None else (subset(options.few[0], number),)
                     trained[train] = [train_stage(title, options.task, self.dataset, train, steps, *choice, *training)]
                 trained[train].append(
-                    self._evaluate(title, checkpoint(train, steps), output, options.latent_seed, *evaluating)
-                )
+                    evaluation_stage(title, options.task, checkpoint(train, steps), output, options.latent_episodes,
+                                     options.latent_seed, *evaluating)
+                )  # fmt: skip
         return [*after, *trained.values()]
 
     def final(self) -> Stage:
@@ -266,6 +264,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=400_000)
     parser.add_argument("--held-out", type=int, default=1000, help="seeds for the last checkpoint")
     parser.add_argument("--held-out-seed", type=int, default=100_000)
+    parser.add_argument("--latent-episodes", type=int, default=100, help="seeds of each evaluation of a latent")
     parser.add_argument("--latent-seed", type=int, default=500_000)
     parser.add_argument(
         "--few", type=int, nargs="+", default=[10, 50], help="numbers of demonstrations; the latents use the first"
@@ -287,8 +286,8 @@ def main() -> None:
     report = Report(options)
     record_stage(options.task, "hdril/learning", report.dataset, options.demonstrations).run()
     report.train_curve()
-    run_chains(report.chains(), options.jobs)
     run_chains([[report.final()]], 1)
+    run_chains(report.chains(), options.jobs)
     found = report.results()
     options.document.parent.mkdir(parents=True, exist_ok=True)
     options.document.with_suffix(".json").write_text(json.dumps(found, indent=1))
