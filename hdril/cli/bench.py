@@ -120,13 +120,17 @@ def bench_action(root: Path, task: str) -> Figure:
     return Figure("one action, amortised over an episode", 1e3 * best / horizon, 2.0, False, "ms")
 
 
-def _samples_per_second(policy, batch: dict, steps: int) -> float:
-    """Frames that training steps (forward, backward, optimiser) take in a second, after one step to warm up."""
+def _samples_per_second(policy, batch: dict, steps: int, mixed: bool = False) -> float:
+    """Frames that training steps (forward, backward, optimiser) take in a second, after one step to warm up. ``mixed``:
+    matrix products in bfloat16, as ``accelerate launch --mixed_precision=bf16`` has them."""
+    import torch
+
     optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
     policy.train()
 
     def step() -> None:
-        loss, _ = policy.forward(batch)
+        with torch.autocast("cpu", torch.bfloat16, enabled=mixed):
+            loss, _ = policy.forward(batch)
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()
@@ -137,7 +141,8 @@ def _samples_per_second(policy, batch: dict, steps: int) -> float:
 
 
 def bench_policies(root: Path) -> list[Figure]:
-    """HDR-IL's training against ACT's, both at LeRobot's defaults, and its two ways of calling its models; one core."""
+    """HDR-IL's training against ACT's, both at LeRobot's defaults, and what its own choices (models called one by one, float32)
+    gain or cost; one core."""
     import torch
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.policies.act.configuration_act import ACTConfig
@@ -151,11 +156,11 @@ def bench_policies(root: Path) -> list[Figure]:
     def frames(count: int) -> dict[str, torch.Tensor]:
         return {"index": torch.randint(metadata.total_frames, (count,), generator=generator)}
 
-    def hdril(how: str) -> float:
+    def hdril(how: str, mixed: bool = False) -> float:
         config = HDRILConfig(device="cpu", push_to_hub=False, experts=how)  # pyright: ignore
-        return _samples_per_second(make_policy(config, ds_meta=metadata), frames(64), 5)
+        return _samples_per_second(make_policy(config, ds_meta=metadata), frames(64), 5, mixed)
 
-    separate, stacked = hdril("separate"), hdril("stacked")
+    separate, stacked, mixed = hdril("separate"), hdril("stacked"), hdril("separate", mixed=True)
     act_config = ACTConfig(device="cpu", push_to_hub=False)
     act = make_policy(act_config, ds_meta=metadata)
     batch = frames(8)
@@ -167,6 +172,7 @@ def bench_policies(root: Path) -> list[Figure]:
     return [
         Figure("training, samples per second against ACT's", separate / theirs, 30.0, True, "times"),
         Figure("the models one by one against stacked", separate / stacked, 0.9, True, "times"),
+        Figure("training in float32 against mixed precision", separate / mixed, 0.9, True, "times"),
     ]
 
 
