@@ -21,7 +21,7 @@ def stages(output: Path, episodes: int, steps: int, evaluations: int) -> list[St
     policy = train / "checkpoints" / "last" / "pretrained_model"
     return [
         record_stage("table_lift", "hdril/table_lift", dataset, episodes),
-        train_stage("HDR-IL", "table_lift", dataset, train, steps),
+        train_stage("HDR-IL", "train/table_lift", dataset, train, steps),
         Stage(
             "evaluation with LeRobot's own command, 10 episodes",
             ("lerobot-eval", f"--policy.path={policy}", "--env.type=hdril", "--env.task=table_lift",

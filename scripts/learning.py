@@ -48,6 +48,7 @@ class Report:
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options
+        self.config = f"train/{options.task}"
         self.dataset = options.output / "dataset"
         self.curve = options.output / "curve"
         self.started = self.curve / "started.json"
@@ -55,7 +56,7 @@ class Report:
 
     def train_curve(self) -> None:
         """Train with all demonstrations, nothing of ours beside it, and remember when it began."""
-        stage = train_stage("all demonstrations", self.options.task, self.dataset, self.curve / "train",
+        stage = train_stage("all demonstrations", self.config, self.dataset, self.curve / "train",
                             self.options.steps, save_every=CURVE_STRIDE)  # fmt: skip
         if not stage.result.exists():
             self.curve.mkdir(parents=True, exist_ok=True)
@@ -68,7 +69,7 @@ class Report:
 
     def few_train(self, size: int, number: int) -> Stage:
         """Training on few demonstrations, with the default latent."""
-        return train_stage(f"{size} demonstrations, choice {number}", self.options.task, self.dataset,
+        return train_stage(f"{size} demonstrations, choice {number}", self.config, self.dataset,
                            self.few(size, number) / "train", self.options.few_steps, subset(size, number))  # fmt: skip
 
     def few(self, size: int, number: int) -> Path:
@@ -105,7 +106,7 @@ class Report:
                 steps = options.steps if number is None else options.few_steps
                 if train not in trained:
                     choice = () if number is None else (subset(options.few[0], number),)
-                    trained[train] = [train_stage(title, options.task, self.dataset, train, steps, *choice, *training)]
+                    trained[train] = [train_stage(title, self.config, self.dataset, train, steps, *choice, *training)]
                 trained[train].append(
                     evaluation_stage(title, options.task, checkpoint(train, steps), output, options.latent_episodes,
                                      options.latent_seed, *evaluating)

@@ -48,10 +48,10 @@ def parameters(preset: str, dataset: Path) -> dict[str, int]:
 def chain(preset: str, options: argparse.Namespace, dataset: Path) -> list[Stage]:
     """Training and the two evaluations of one preset."""
     folder = options.output / preset
-    batch = (f"--policy.preset={preset}", f"--batch_size={options.batch_size}")
+    batch = f"--batch_size={options.batch_size}"
     policy = checkpoint(folder / "train", options.steps)
     return [
-        train_stage(preset, options.task, dataset, folder / "train", options.steps, *batch),
+        train_stage(preset, f"presets/{preset}", dataset, folder / "train", options.steps, batch),
         *(
             evaluation_stage(f"{preset}, {rollout}", options.task, policy, folder / rollout, options.episodes, options.seed,
                              f"--policy.rollout={rollout}")

@@ -61,13 +61,13 @@ def record_stage(task: str, repo_id: str, root: Path, episodes: int) -> Stage:
 
 
 def train_stage(
-    title: str, task: str, dataset: Path, train: Path, steps: int, *options: str, save_every: int = 0
+    title: str, config: str, dataset: Path, train: Path, steps: int, *options: str, save_every: int = 0
 ) -> Stage:
-    """Stock ``lerobot-train`` with the task's config. A training that was cut off before its end starts anew:
+    """Stock ``lerobot-train`` with ``configs/{config}.yaml``. A training that was cut off before its end starts anew:
     ``lerobot-train`` refuses the folder that it left."""
     return Stage(
         f"{title}: training, {steps} steps",
-        ("lerobot-train", f"--config_path=configs/train/{task}.yaml", f"--dataset.root={dataset}",
+        ("lerobot-train", f"--config_path=configs/{config}.yaml", f"--dataset.root={dataset}",
          f"--output_dir={train}", f"--steps={steps}", f"--save_freq={save_every or steps}", *options),
         checkpoint(train, steps) / "model.safetensors",
         threads=1,  # the matrices are small: a second thread slows them down

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
@@ -11,7 +12,11 @@ import sys
 import time
 from pathlib import Path
 
+import draccus
 import pytest
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot_policy_hdril import HDRILConfig
+from lerobot_policy_hdril.presets import PRESETS
 
 BIN = Path(sys.executable).parent
 REPO = Path(__file__).parents[1]
@@ -41,6 +46,19 @@ def checkpoint(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("hdril") / "train"
     train(dataset, output, "--steps=2", "--save_freq=2")
     return output / "checkpoints" / "last" / "pretrained_model"
+
+
+def test_each_preset_has_a_config_and_they_differ_in_nothing_else() -> None:
+    files = {path.stem: path for path in (REPO / "configs/presets").glob("*.yaml")}
+    assert set(files) == set(PRESETS)
+    rest = []
+    for name, path in files.items():
+        config = draccus.parse(TrainPipelineConfig, path, args=[])
+        assert isinstance(config.policy, HDRILConfig)
+        assert config.policy.preset == config.job_name == name
+        assert config.output_dir == Path("outputs/table_lift") / name
+        rest.append(dataclasses.replace(config, policy=None, job_name=None, output_dir=None))
+    assert all(one == rest[0] for one in rest)
 
 
 def test_training_resumes(checkpoint: Path) -> None:
