@@ -61,7 +61,7 @@ class Report:
         if not stage.result.exists():
             self.curve.mkdir(parents=True, exist_ok=True)
             self.started.write_text(json.dumps({"time": time.time(), "cores": os.cpu_count()}))
-        stage.run()
+        run_chains([[stage]])
 
     def _evaluate(self, title: str, policy: Path, output: Path) -> Stage:
         options = self.options
@@ -287,9 +287,9 @@ def main() -> None:
             f"--choices={options.choices} of {max(options.few)} need more than {options.demonstrations} demonstrations"
         )
     report = Report(options)
-    record_stage(options.task, "hdril/learning", report.dataset, options.demonstrations).run()
+    run_chains([[record_stage(options.task, "hdril/learning", report.dataset, options.demonstrations)]])
     report.train_curve()
-    run_chains([[report.final()]], 1)
+    run_chains([[report.final()]])
     run_chains(report.chains(), options.jobs)
     found = report.results()
     options.document.parent.mkdir(parents=True, exist_ok=True)

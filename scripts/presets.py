@@ -135,7 +135,7 @@ def main() -> None:
         print(f"{options.document.with_suffix('.json')} has them all")
         return
     count = 1 if options.parameters else options.demonstrations
-    record_stage(options.task, "hdril/presets", dataset, count).run()
+    run_chains([[record_stage(options.task, "hdril/presets", dataset, count)]])
     if options.parameters:
         for preset in options.presets:
             counts = parameters(preset, dataset)

@@ -87,12 +87,13 @@ def evaluation_stage(
     )  # fmt: skip
 
 
-def run_chains(chains: Iterable[list[Stage]], jobs: int) -> None:
+def run_chains(chains: Iterable[list[Stage]], jobs: int = 1) -> None:
     """Run the stages of each chain in order, ``jobs`` chains at a time.
 
     Raises:
-        SystemExit: a command failed; says which.
+        SystemExit: a command failed, or Ctrl-C; says which.
     """
+    script = Path(sys.argv[0]).stem
 
     def run(chain: list[Stage]) -> None:
         for stage in chain:
@@ -102,7 +103,11 @@ def run_chains(chains: Iterable[list[Stage]], jobs: int) -> None:
         with ThreadPoolExecutor(jobs) as pool:
             list(pool.map(run, chains))
     except subprocess.CalledProcessError as error:
-        sys.exit(f"{Path(sys.argv[0]).stem}: {error.cmd[0]} failed with exit code {error.returncode}")
+        sys.exit(
+            f"{script}: {Path(error.cmd[0]).name} failed with exit code {error.returncode}; run its command to see why"
+        )
+    except KeyboardInterrupt:
+        sys.exit(f"\n{script}: interrupted; run it again to go on")
 
 
 def commit() -> str:
