@@ -9,12 +9,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from hdril.conditions import ROBOT, failed
-from hdril.control import ACTION_NAMES, EndEffectorController, split_action
 from hdril.geometry import IDENTITY_QUATERNION
-from hdril.robots import ROBOTS
+from hdril.simulation.actions import ACTION_NAMES, split_action
+from hdril.simulation.controller import EndEffectorController
+from hdril.simulation.robots import ROBOTS
+from hdril.simulation.world import ROBOT, Physics, World
 from hdril.tasks import get_task
-from hdril.world import Physics, World
+from hdril.tasks.conditions import failed
 
 SETTLE_PERIODS = 2
 
@@ -23,8 +24,8 @@ class BimanualEnv(gym.Env):
     """World x task x end-effector control, 10 actions a second.
 
     Observation: ``agent_pos`` (16,), measured hand poses and openings; ``environment_state`` (7 per observed object).
-    Action (16,): commanded hand poses and openings, in the same order (:data:`hdril.control.ACTION_NAMES`); quaternions
-    are normalised, openings clipped to [0, 1]. Reward: 1 on success. ``info["is_success"]`` is judged from the task's
+    Action (16,): hand poses and openings to reach, in the same order (:data:`~hdril.simulation.actions.ACTION_NAMES`);
+    quaternions are normalised, openings clipped to [0, 1]. Reward: 1 on success. ``info["is_success"]`` is judged from the task's
     horizon on; the episode ends then with success, and at ``max_episode_steps`` (the horizon unless given) anyway.
 
     Raises:

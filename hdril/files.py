@@ -8,6 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
+MAX_SEED = 2**31 - 1
+"""Largest seed of an episode."""
+
 
 def cache_folder() -> Path:
     """Folder of what can be made again: ``hdril`` in ``$XDG_CACHE_HOME``, or in ``~/.cache``."""

@@ -11,8 +11,8 @@ from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
-from hdril.control import ACTION_NAMES
 from hdril.env import BimanualEnv
+from hdril.simulation.actions import ACTION_NAMES
 from hdril.tasks import TASKS, get_task
 
 for _task in TASKS.values():
@@ -79,7 +79,7 @@ class HDRILEnvConfig(EnvConfig):
         """
         get_task(self.task or "")
         if self.rerun != "none":
-            from hdril.evaluation import check_keep
+            from hdril.viewer.keep import check_keep
 
             check_keep("env.rerun", self.rerun)
         factories = [partial(make_env, self.task, self.recordings, **self.gym_kwargs)] * n_envs
@@ -98,7 +98,7 @@ def make_env(task: str, recordings: dict[str, str], **kwargs) -> gym.Env:
     env: gym.Env = BimanualEnv(task, **kwargs)
     if recordings["keep"] != "none":
         # Here and not above: LeRobot imports this module at each of its commands' start.
-        from hdril.recorded_episodes import RecordedEpisodes
+        from hdril.viewer.recorded_environment import RecordedEpisodes
 
         env = RecordedEpisodes(env, recordings["keep"], Path(recordings["folder"]))  # pyright: ignore
     return FreezeAfterEpisodeEnd(env)

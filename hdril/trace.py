@@ -2,39 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hdril.conditions import ROBOT
-from hdril.demonstrator import Demonstrator, Observation
+from hdril.actor import Actor, Explanation, Observation
 from hdril.env import BimanualEnv
-from hdril.robots.spec import SIDES
-
-
-@dataclass(frozen=True)
-class Belief:
-    """What a policy with primitives thinks at a frame, in the task's labels."""
-
-    primitive: int
-    """Label of what it plays."""
-    probabilities: NDArray[np.float32]
-    """(K,), the planner's."""
-    plan: NDArray[np.float32] | None
-    """(M, 16), the actions from here to the end of the primitive, if it has just planned anew."""
-    attention: dict[str, float]
-    """Share of the playing model's attention that each hand and object receives."""
-
-
-@dataclass(frozen=True)
-class Move:
-    """What a policy answers to an observation."""
-
-    action: NDArray[np.float32]  # (16,)
-    belief: Belief | None = None
+from hdril.rollout import Ending, Transition, run_episode
+from hdril.simulation.robots.spec import SIDES
+from hdril.simulation.world import ROBOT
 
 
 @dataclass(frozen=True)
@@ -47,7 +25,7 @@ class Trace:
     joints: NDArray[np.float64]  # (T + 1, joints of the robot)
     reward: NDArray[np.float32]  # (T,)
     scripted: NDArray[np.int64]  # (T,), label of the expert; -1 past its end
-    beliefs: tuple[Belief | None, ...]  # (T,)
+    explanations: tuple[Explanation | None, ...]  # (T,)
     ik_failures: tuple[str, ...]  # (T,), empty strings where there was none
     stage: NDArray[np.int64]  # (T + 1,), how many of the task's stages were reached, success being the last
     measures: NDArray[np.float64]  # (T + 1, measures of the task)
@@ -57,17 +35,14 @@ class Trace:
 
     @property
     def executed(self) -> NDArray[np.int64]:
-        """(T,), label of the primitive that the policy plays; -1 if it has none."""
-        return np.array([-1 if belief is None else belief.primitive for belief in self.beliefs])
+        """(T,), label of the primitive that the actor executes; -1 if it has none."""
+        return np.array([-1 if e is None else e.primitive for e in self.explanations])
 
     @property
     def predicted(self) -> NDArray[np.int64]:
-        """(T,), label of the primitive that the planner prefers; it is heard when one is over. -1 if there is none."""
-        return np.array([-1 if belief is None else int(belief.probabilities.argmax()) for belief in self.beliefs])
-
-
-Act = Callable[[Observation], Move]
-"""A policy as the evaluation sees it."""
+        """(T,), label of the primitive that the planner finds most probable; -1 if there is no planner. The actor follows
+        the planner when a primitive is over, so the two may differ until then."""
+        return np.array([-1 if e is None else int(e.probabilities.argmax()) for e in self.explanations])
 
 
 def _contacts(env: BimanualEnv) -> tuple[NDArray[np.float64], dict[str, bool]]:
@@ -85,15 +60,10 @@ def _contacts(env: BimanualEnv) -> tuple[NDArray[np.float64], dict[str, bool]]:
 
 
 class TraceRecorder:
-    """Collects an episode of an environment, frame by frame.
+    """An observer that collects an episode, frame by frame."""
 
-    Args:
-        env: at the start of an episode.
-        observation: what its ``reset`` gave.
-        info: likewise.
-    """
-
-    def __init__(self, env: BimanualEnv, observation: Observation, info: dict[str, Any]) -> None:
+    def begin(self, env: BimanualEnv, observation: Observation, info: dict[str, Any]) -> None:
+        """Start with the first observation of an episode."""
         self._env = env
         self._progress_keys = ("stage", *(measure.name for measure in env.task_spec.measures))
         self._joints = env.world.joint_indices(ROBOT, env.controller.joint_names)
@@ -101,10 +71,7 @@ class TraceRecorder:
         self._positions: list[NDArray[np.float64]] = []
         self._progress: list[list[float]] = []
         self._touches: list[tuple[NDArray[np.float64], dict[str, bool]]] = []
-        self._actions: list[NDArray[np.float32]] = []
-        self._rewards: list[float] = []
-        self._beliefs: list[Belief | None] = []
-        self._failures: list[str] = []
+        self._transitions: list[Transition] = []
         self._ik_errors: list[list[float]] = []
         self._see(observation, info)
 
@@ -114,29 +81,26 @@ class TraceRecorder:
         self._progress.append([info[key] for key in self._progress_keys])
         self._touches.append(_contacts(self._env))
 
-    def add(self, move: Move, observation: Observation, reward: float, info: dict[str, Any]) -> None:
-        """A frame: what was done, and what ``step`` gave for it."""
-        self._actions.append(np.asarray(move.action, np.float32))
-        self._beliefs.append(move.belief)
-        self._rewards.append(reward)
-        self._failures.append(info["ik_failure"])
+    def observe(self, transition: Transition) -> None:
+        """Add a frame."""
+        self._transitions.append(transition)
         self._ik_errors.append([self._env.controller.results[side].position_error for side in SIDES])
-        self._see(observation, info)
+        self._see(transition.next_observation, transition.info)
 
-    def finish(self, labels: NDArray[np.int64]) -> Trace:
-        """The episode; ``labels`` are the expert's."""
-        scripted = np.full(len(self._actions), -1)
-        scripted[: len(labels)] = labels[: len(self._actions)]
+    def trace(self, labels: NDArray[np.int64]) -> Trace:
+        """The episode so far; ``labels`` are the expert's."""
+        scripted = np.full(len(self._transitions), -1)
+        scripted[: len(labels)] = labels[: len(self._transitions)]
         touches = self._touches
         return Trace(
             state=np.stack([o["agent_pos"] for o in self._observations]),
             environment_state=np.stack([o["environment_state"] for o in self._observations]),
-            action=np.stack(self._actions),
+            action=np.stack([t.decision.action for t in self._transitions]),
             joints=np.stack(self._positions),
-            reward=np.array(self._rewards, np.float32),
+            reward=np.array([t.reward for t in self._transitions], np.float32),
             scripted=scripted,
-            beliefs=tuple(self._beliefs),
-            ik_failures=tuple(self._failures),
+            explanations=tuple(t.decision.explanation for t in self._transitions),
+            ik_failures=tuple(t.info["ik_failure"] for t in self._transitions),
             stage=np.array([row[0] for row in self._progress]),
             measures=np.array([row[1:] for row in self._progress], dtype=np.float64),
             ik_error=np.array(self._ik_errors),
@@ -145,31 +109,11 @@ class TraceRecorder:
         )
 
 
-def run_episode(env: BimanualEnv, act: Act, seed: int, labels: NDArray[np.int64]) -> tuple[Trace, bool, str]:
-    """Play the scene of ``seed``; ``labels`` are the expert's. Also whether it succeeded, and what was not met."""
-    observation, info = env.reset(seed=seed)
-    recorder = TraceRecorder(env, observation, info)
-    done = False
-    while not done:
-        move = act(observation)
-        observation, reward, terminated, truncated, info = env.step(move.action)
-        done = terminated or truncated
-        recorder.add(move, observation, reward, info)
-    return recorder.finish(labels), bool(info["is_success"]), str(info["unmet"])
-
-
-def demonstrate_trace(env: BimanualEnv, expert: Demonstrator, seed: int) -> Trace:
-    """The expert's episode of this seed, as a trace."""
-    expert.reset(seed)
-    labels = np.repeat(
-        [env.task_spec.labels.index(p.name) for p in env.task_spec.primitives],
-        [p.frames for p in env.task_spec.primitives],
-    )
-
-    certain = np.eye(len(env.task_spec.labels), dtype=np.float32)
-
-    def act(observation: Observation) -> Move:
-        step = expert.act(observation)
-        return Move(step.action.astype(np.float32), Belief(step.label, certain[step.label], None, {}))
-
-    return run_episode(env, act, seed, labels)[0]
+def trace_episode(
+    env: BimanualEnv, actor: Actor, seed: int, labels: NDArray[np.int64] | None = None
+) -> tuple[Trace, Ending]:
+    """Play the scene of ``seed`` and trace it. ``labels`` are the expert's; the actor's own unless given."""
+    recorder = TraceRecorder()
+    ending = run_episode(env, actor, seed, recorder)
+    trace = recorder.trace(np.array([], np.int64) if labels is None else labels)
+    return (replace(trace, scripted=trace.executed) if labels is None else trace), ending

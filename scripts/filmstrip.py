@@ -16,9 +16,10 @@ matplotlib.use("agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from hdril.demonstrator import Demonstrator
 from hdril.env import BimanualEnv
-from hdril.primitives import Noise
+from hdril.rollout import transitions
+from hdril.tasks.expert import Demonstrator
+from hdril.tasks.primitives import Noise
 
 
 def frames(task: str, seed: int) -> list[tuple[str, np.ndarray]]:
@@ -26,14 +27,13 @@ def frames(task: str, seed: int) -> list[tuple[str, np.ndarray]]:
     env = BimanualEnv(task, meshes=True)
     expert = Demonstrator(env.task_spec, Noise(0.0))
     camera = replace(env.task_spec.camera, width=480, height=400)
+    ends = np.cumsum([primitive.frames for primitive in env.task_spec.primitives])
     pictures = []
     with closing(env):
-        observation, _ = env.reset(seed=seed)
-        expert.reset(seed)
-        for primitive in env.task_spec.primitives:
-            for _ in range(primitive.frames):
-                observation, *_ = env.step(expert.act(observation).action)
-            pictures.append((primitive.name, env.world.render(camera)))
+        for frame, _ in enumerate(transitions(env, expert, seed), start=1):
+            if frame in ends:
+                name = env.task_spec.primitives[int(np.searchsorted(ends, frame))].name
+                pictures.append((name, env.world.render(camera)))
     return pictures
 
 

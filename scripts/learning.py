@@ -20,7 +20,7 @@ from typing import Any
 import matplotlib.pyplot as plt
 from stages import Stage, checkpoint, commit, evaluation_stage, record_stage, run_chains, train_stage
 
-from hdril.statistics import wilson_interval
+from hdril.evaluation.statistics import wilson_interval
 
 CURVE_STRIDE = 100
 CURVE_STEPS = (100, 200, 300, 500, 700, 1000, 1500, 2000, 2500)

@@ -14,10 +14,12 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from hdril.control import ACTION_NAMES
+from hdril.actor import Decision, Observation
 from hdril.env import BimanualEnv
-from hdril.evaluation import LeRobotActor
-from hdril.statistics import wilson_interval
+from hdril.evaluation.lerobot_actor import LeRobotActor
+from hdril.evaluation.statistics import wilson_interval
+from hdril.rollout import run_episode
+from hdril.simulation.actions import ACTION_NAMES
 from hdril.tasks import get_task
 
 Action = NDArray[np.float32]
@@ -38,6 +40,30 @@ MISHAPS: dict[str, Callable[[Action, Action], Action]] = {
 }
 
 
+class Mishap:
+    """A policy whose actions of the first primitive are spoilt."""
+
+    def __init__(self, policy: LeRobotActor, spoil: Callable[[Action, Action], Action], frames: int) -> None:
+        self._policy, self._spoil, self._frames = policy, spoil, frames
+
+    def reset(self, seed: int) -> None:
+        self._policy.reset(seed)
+        self._start: Action | None = None
+        self.executed: list[int] = []
+        """Labels of what the policy executed, frame by frame."""
+
+    def act(self, observation: Observation) -> Decision:
+        decision = self._policy.act(observation)
+        if decision.explanation is None:
+            raise ValueError("the policy has no primitives")
+        start = observation["agent_pos"].copy() if self._start is None else self._start
+        self._start = start
+        self.executed.append(decision.explanation.primitive)
+        if len(self.executed) > self._frames:
+            return decision
+        return Decision(self._spoil(np.asarray(decision.action, np.float32), start), decision.explanation)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--policy", required=True, help="a checkpoint with primitives (--policy.type=hdril)")
@@ -46,26 +72,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=700_000)
     options = parser.parse_args()
     task = get_task(options.task)
-    env, actor = BimanualEnv(options.task, max_episode_steps=3 * task.horizon), LeRobotActor(options.policy, task)
-    for name, mishap in MISHAPS.items():
+    env, policy = BimanualEnv(options.task, max_episode_steps=3 * task.horizon), LeRobotActor(options.policy, task)
+    first = task.primitives[0].frames
+    for name, spoil in MISHAPS.items():
         again = successes = 0
+        actor = Mishap(policy, spoil, first)
         for seed in range(options.seed, options.seed + options.episodes):
-            observation, info = env.reset(seed=seed)
-            actor.reset(seed)
-            start, played = observation["agent_pos"].copy(), []
-            done = False
-            while not done:
-                move = actor.act(observation)
-                if move.belief is None:
-                    parser.error(f"{options.policy} has no primitives")
-                played.append(move.belief.primitive)
-                missed = len(played) <= task.primitives[0].frames
-                observation, _, terminated, truncated, info = env.step(
-                    mishap(move.action, start) if missed else move.action
-                )
-                done = terminated or truncated
-            again += played[task.primitives[0].frames] == played[0]
-            successes += bool(info["is_success"])
+            successes += run_episode(env, actor, seed).success
+            again += actor.executed[first] == actor.executed[0]
         low, high = wilson_interval(successes, options.episodes)
         print(f"{name}: tried again at once in {again}, succeeded in {successes} of {options.episodes} "
               f"({100 * low:.0f} to {100 * high:.0f} %)", flush=True)  # fmt: skip

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
-from hdril.recording import Recipe, record
+from hdril.demonstrations.provenance import Recipe
+from hdril.demonstrations.record import record
 
 
 @pytest.fixture(scope="session")

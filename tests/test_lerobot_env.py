@@ -17,10 +17,10 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot.scripts.lerobot_eval import eval_policy
 from lerobot_policy_hdril import HDRILConfig
 
-from hdril.demonstrator import Demonstrator
 from hdril.lerobot_env import HDRILEnvConfig
-from hdril.primitives import Noise
 from hdril.tasks import TASKS, get_task
+from hdril.tasks.expert import Demonstrator
+from hdril.tasks.primitives import Noise
 
 
 class Scripted(PreTrainedPolicy):

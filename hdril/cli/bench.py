@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hdril.cli.common import run
-from hdril.recording import Recipe, record
+from hdril.demonstrations.provenance import Recipe
+from hdril.demonstrations.record import record
+from hdril.simulation.world import World
 from hdril.tasks import get_task
-from hdril.world import World
 
 
 @dataclass
@@ -164,7 +165,7 @@ def bench_policies(root: Path) -> list[Figure]:
     act_config = ACTConfig(device="cpu", push_to_hub=False)
     act = make_policy(act_config, ds_meta=metadata)
     batch = frames(8)
-    for key, feature in act_config.input_features.items():
+    for key, feature in (act_config.input_features or {}).items():
         batch[key] = torch.randn(8, *feature.shape, generator=generator)
     batch["action"] = torch.randn(8, act_config.chunk_size, *metadata.features["action"]["shape"], generator=generator)
     batch["action_is_pad"] = torch.zeros(8, act_config.chunk_size, dtype=torch.bool)
@@ -179,22 +180,24 @@ def bench_policies(root: Path) -> list[Figure]:
 def bench_rerun(task: str, folder: Path) -> Figure:
     """Share of an evaluation, the expert's episode included, that its Rerun recording takes; one core. The policy's own time
     is left out: the share with one is less."""
-    from hdril.demonstrator import Demonstrator
     from hdril.env import BimanualEnv
-    from hdril.evaluation import Reference, judge
-    from hdril.primitives import Noise
-    from hdril.rerun_log import write_recording
-    from hdril.trace import demonstrate_trace
+    from hdril.evaluation.evaluate import EvaluatedEpisode
+    from hdril.evaluation.reference import Reference
+    from hdril.evaluation.score import score_episode
+    from hdril.tasks.expert import Demonstrator
+    from hdril.tasks.primitives import Noise
+    from hdril.trace import trace_episode
+    from hdril.viewer.recordings import write_recording
 
     env = BimanualEnv(task)
     expert, seconds = Demonstrator(env.task_spec, Noise(0.0)), {"episodes": 0.0, "recording": 0.0}
     for seed in range(5):
         start = time.perf_counter()
-        trace, again = (demonstrate_trace(env, expert, seed) for _ in range(2))
+        (trace, ending), (again, _) = (trace_episode(env, expert, seed) for _ in range(2))
         reference = Reference.of(again)
-        outcome = judge(env.task_spec, seed, trace, reference, True, "")
+        outcome = score_episode(env.task_spec, seed, trace, reference, ending)
         middle = time.perf_counter()
-        write_recording(folder, env, outcome, trace, reference)
+        write_recording(folder, EvaluatedEpisode(env, outcome, trace, reference))
         if seed:  # the first one starts Rerun
             seconds["episodes"] += middle - start
             seconds["recording"] += time.perf_counter() - middle

@@ -14,9 +14,13 @@ from pathlib import Path
 from tqdm import tqdm
 
 from hdril.cli.common import run
-from hdril.evaluation import Job, Outcome, check_held_out, check_keep, evaluate, training_provenance
-from hdril.report import Run, headline, write_report
+from hdril.evaluation.evaluate import Job, evaluate
+from hdril.evaluation.held_out import check_held_out, training_provenance
+from hdril.evaluation.report import Run, headline, write_report
+from hdril.evaluation.score import Outcome
 from hdril.tasks import get_task
+from hdril.viewer.keep import check_keep
+from hdril.viewer.recordings import RecordingWriter
 
 
 @dataclass
@@ -92,14 +96,13 @@ def eval_command(config: EvalConfig, overrides: tuple[str, ...] = ()) -> None:
         return
     partial = output.with_name(output.name + ".partial")
     done = _resume(partial, what)
-    job = Job(
-        config.task, config.policy.path, overrides, config.policy.device, partial / "rerun", config.rerun, config.seed
-    )
+    job = Job(config.task, config.policy.path, overrides, config.policy.device)
+    writer = RecordingWriter(partial / "rerun", config.rerun, config.seed) if config.rerun != "none" else None
     start = time.monotonic()
     outcomes = [done[seed] for seed in seeds if seed in done]
     left = [seed for seed in seeds if seed not in done]
     try:
-        _play(job, left, min(config.workers, max(len(left), 1)), outcomes, partial / "outcomes.jsonl")
+        _play(job, left, min(config.workers, max(len(left), 1)), writer, outcomes, partial / "outcomes.jsonl")
     except Exception:
         if not outcomes:  # nothing to go on from
             shutil.rmtree(partial)
@@ -131,8 +134,8 @@ def _push(config: EvalConfig, output: Path) -> None:
     """Results and report, the card, and the checkpoint if it lies here, in one commit."""
     from huggingface_hub import ModelCard
 
-    from hdril.cards import checkpoint_card, folder_of, with_evaluation
-    from hdril.hub import publish, read_text
+    from hdril.hub.cards import checkpoint_card, folder_of, with_evaluation
+    from hdril.hub.publish import publish, read_text
 
     summary = json.loads((output / "results.json").read_text())
     folder, checkpoint = folder_of(summary), Path(config.policy.path)
@@ -151,14 +154,21 @@ def _push(config: EvalConfig, output: Path) -> None:
     print(f"Published: {publish(config.push, 'model', files, headline(summary), config.private)}")
 
 
-def _play(job: Job, seeds: list[int], workers: int, outcomes: list[Outcome], journal: Path) -> None:
+def _play(
+    job: Job,
+    seeds: list[int],
+    workers: int,
+    writer: RecordingWriter | None,
+    outcomes: list[Outcome],
+    journal: Path,
+) -> None:
     """Evaluate ``seeds``, adding to ``outcomes`` and to the journal as they come."""
     with (
         journal.open("a") as file,
         tqdm(
             total=len(seeds) + len(outcomes), initial=len(outcomes), desc=f"evaluating {job.task}", unit="episode"
         ) as bar,
-        closing(evaluate(job, seeds, workers)) as stream,
+        closing(evaluate(job, seeds, workers, writer)) as stream,
     ):
         for outcome in stream:
             file.write(json.dumps(asdict(outcome)) + "\n")

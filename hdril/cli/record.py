@@ -11,8 +11,9 @@ from pathlib import Path
 from tqdm import tqdm
 
 from hdril.cli.common import run
-from hdril.primitives import Noise
-from hdril.recording import Recipe, read_provenance, record
+from hdril.demonstrations.provenance import Recipe, read_provenance
+from hdril.demonstrations.record import record
+from hdril.tasks.primitives import Noise
 
 
 @dataclass
@@ -86,8 +87,8 @@ def _check_same(root: Path, recipe: Recipe, config: RecordConfig) -> None:
 
 
 def _push(config: RecordConfig, root: Path) -> None:
-    from hdril.cards import dataset_card
-    from hdril.hub import publish
+    from hdril.hub.cards import dataset_card
+    from hdril.hub.publish import publish
 
     files: dict[str, Path | bytes] = {
         str(path.relative_to(root)): path

@@ -13,7 +13,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from hdril.cli.common import run
-from hdril.viewing import Evaluation, compare, replay, show_dataset
+from hdril.viewer.episodes import Evaluation, compare, replay, show_dataset
 
 MADE = Path("outputs/view")
 

@@ -12,13 +12,13 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdril.conditions import Condition, Measure, Stage, lies_at, raised, upright
 from hdril.geometry import Pose
-from hdril.primitives import Grip, Grips, Scene, Targets, carry_each, lift_joined, lower, reach, retract
-from hdril.robots.spec import SIDES
-from hdril.tasks.scene import BENCH, BENCH_PLACEMENT
+from hdril.simulation.robots.spec import SIDES
+from hdril.simulation.world import BodySpec, Box, Physics, World
+from hdril.tasks.bench import BENCH, BENCH_PLACEMENT
+from hdril.tasks.conditions import Condition, Measure, Stage, lies_at, raised, upright
+from hdril.tasks.primitives import Grip, Grips, Scene, Targets, carry_each, lift_joined, lower, reach, retract
 from hdril.tasks.task import Task, Uniform
-from hdril.world import BodySpec, Box, Physics, World
 
 LEFT, RIGHT = "left_half", "right_half"
 DEPTH, WIDTH, TOP, BOARD = 0.35, 0.425, 0.30, 0.06
@@ -163,7 +163,7 @@ def make_task(clearance: float = 0.005, chamfer: float = 0.0) -> Task:
         if not low <= value <= high:
             raise ValueError(f"{name} must be from {low:g} to {high:g} m, got {value:g}")
     on_left, on_right, on_both = _grips(LEFT, LEFT), _grips(RIGHT, RIGHT), _grips(LEFT, RIGHT)
-    held = dict(zip(SIDES, (LEFT, RIGHT), strict=True))
+    held: dict[str, str] = dict(zip(SIDES, (LEFT, RIGHT), strict=True))
     frames = 10
     return Task(
         name="peg_in_hole",

@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdril.conditions import ROBOT, at_height, at_rest, not_touching, touching, upright
 from hdril.geometry import Pose
-from hdril.primitives import Grip, extend, grasp, lift, move, place, retract
-from hdril.tasks.scene import BENCH, BENCH_PLACEMENT
+from hdril.simulation.world import ROBOT, BodySpec, Box
+from hdril.tasks.bench import BENCH, BENCH_PLACEMENT
+from hdril.tasks.conditions import at_height, at_rest, not_touching, touching, upright
+from hdril.tasks.primitives import Grip, extend, grasp, lift, move, place, retract
 from hdril.tasks.task import Task, Uniform, fixed
-from hdril.world import BodySpec, Box
 
 DEPTH, WIDTH, TOP = 0.35, 0.85, 0.30
 BOARD = 0.06  # thicker than the jaws are wide, so that the board itself cannot be pinched

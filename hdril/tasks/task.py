@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hdril.conditions import Condition, Measure, Stage, failed
 from hdril.geometry import Pose
-from hdril.primitives import Primitive
-from hdril.world import BodySpec, Camera, Physics, World
+from hdril.simulation.world import BodySpec, Camera, Physics, World
+from hdril.tasks.conditions import Condition, Measure, Stage, failed
+from hdril.tasks.primitives import Primitive
 
 DEFAULT_CAMERA = Camera()
 DEFAULT_PHYSICS = Physics()

@@ -1,8 +1,0 @@
-"""Robots by name."""
-
-from hdril.robots.baxter import BAXTER
-from hdril.robots.spec import SIDES, Actuation, ArmSpec, GripperSpec, RobotSpec
-
-ROBOTS: dict[str, RobotSpec] = {robot.name: robot for robot in (BAXTER,)}
-
-__all__ = ["ROBOTS", "SIDES", "Actuation", "ArmSpec", "GripperSpec", "RobotSpec"]

@@ -1,0 +1,74 @@
+"""The episode loop: an actor on an environment, watched by observers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from hdril.actor import Actor, Decision, Observation
+from hdril.env import BimanualEnv
+
+
+@dataclass(frozen=True)
+class Transition:
+    """One frame of an episode: what was seen, what was done, and what ``step`` returned."""
+
+    observation: Observation
+    decision: Decision
+    """The action is float32, as it was sent."""
+    next_observation: Observation
+    reward: float
+    terminated: bool
+    truncated: bool
+    info: dict[str, Any]
+
+
+class Observer(Protocol):
+    """Watches an episode. It must not change the environment."""
+
+    def begin(self, env: BimanualEnv, observation: Observation, info: dict[str, Any]) -> None:
+        """An episode has been reset; ``observation`` and ``info`` are what ``reset`` returned."""
+        ...
+
+    def observe(self, transition: Transition) -> None:
+        """A frame is over."""
+        ...
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How an episode ended: whether it succeeded, the conditions of success that do not hold, and its frames."""
+
+    success: bool
+    unmet: str
+    frames: int
+
+
+def transitions(env: BimanualEnv, actor: Actor, seed: int, *observers: Observer) -> Iterator[Transition]:
+    """Play the scene of ``seed`` frame by frame, until the environment terminates or truncates the episode."""
+    observation, info = env.reset(seed=seed)
+    actor.reset(seed)
+    for observer in observers:
+        observer.begin(env, observation, info)
+    over = False
+    while not over:
+        decision = actor.act(observation)
+        # float32 is what a dataset stores: an episode can be played again from its recorded actions.
+        decision = Decision(np.asarray(decision.action, np.float32), decision.explanation)
+        following, reward, terminated, truncated, info = env.step(decision.action)
+        transition = Transition(observation, decision, following, float(reward), terminated, truncated, info)
+        for observer in observers:
+            observer.observe(transition)
+        yield transition
+        observation, over = following, terminated or truncated
+
+
+def run_episode(env: BimanualEnv, actor: Actor, seed: int, *observers: Observer) -> Ending:
+    """Play the scene of ``seed`` to its end."""
+    frames, info = 0, {}
+    for transition in transitions(env, actor, seed, *observers):
+        frames, info = frames + 1, transition.info
+    return Ending(bool(info["is_success"]), str(info["unmet"]), frames)

@@ -1,0 +1,59 @@
+"""Episodes as Rerun files: which are kept, what they are called, and how they are written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import rerun as rr
+
+from hdril.evaluation.evaluate import EvaluatedEpisode
+from hdril.evaluation.score import Outcome
+from hdril.viewer.blueprint import blueprint
+from hdril.viewer.keep import keeps
+from hdril.viewer.log import EpisodeLog
+
+APPLICATION = "hdril"
+
+
+@dataclass(frozen=True)
+class RecordingWriter:
+    """Writes the episodes that ``keep`` asks for into ``folder``: a sink for :func:`hdril.evaluation.evaluate.evaluate`.
+
+    ``keep`` is ``none``, ``failures``, ``all``, or the number of episodes to keep from ``first_seed`` on.
+    """
+
+    folder: Path
+    keep: str
+    first_seed: int
+
+    def __call__(self, episode: EvaluatedEpisode) -> None:
+        if keeps(self.keep, episode.outcome.seed - self.first_seed, episode.outcome.success):
+            write_recording(self.folder, episode)
+
+
+def recording_name(outcome: Outcome) -> str:
+    """A name that sorts by seed and says how the episode ended."""
+    return f"seed_{outcome.seed:07d}_{'success' if outcome.success else 'failure'}"
+
+
+def write_recording(folder: Path, episode: EvaluatedEpisode) -> Path:
+    """Write ``<folder>/<recording_name>.rrd``. Times are seconds from the start of the episode."""
+    name = recording_name(episode.outcome)
+    return write_episodes(folder / f"{name}.rrd", name, {"": episode})
+
+
+def write_episodes(path: Path, name: str, episodes: dict[str, EvaluatedEpisode]) -> Path:
+    """Write one recording of several players' episodes of the same seed, side by side on one timeline.
+
+    ``episodes`` are by the name of the player, with which its entities begin; a single one may have the name "". The worlds
+    of their environments must still be open.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    env = next(iter(episodes.values())).env
+    with rr.RecordingStream(APPLICATION, recording_id=f"{env.task}-{name}") as stream:
+        stream.save(path, default_blueprint=blueprint(env, list(episodes)))
+        stream.send_recording_name(name)
+        for player, episode in episodes.items():
+            EpisodeLog(stream, episode, player).send()
+    return path

@@ -1,0 +1,202 @@
+"""Metrics, intervals, held-out seeds, traces, recordings and reports."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hdril.demonstrations.provenance import Provenance, Recipe
+from hdril.env import BimanualEnv
+from hdril.evaluation.evaluate import EvaluatedEpisode
+from hdril.evaluation.held_out import check_held_out, training_provenance
+from hdril.evaluation.metrics import trajectory_error
+from hdril.evaluation.reference import Reference, ReferenceCache
+from hdril.evaluation.report import Run, headline, write_report
+from hdril.evaluation.score import Outcome, score_episode
+from hdril.evaluation.statistics import wilson_interval
+from hdril.rollout import Ending
+from hdril.tasks.expert import Demonstrator
+from hdril.tasks.primitives import Noise
+from hdril.trace import Trace, trace_episode
+from hdril.viewer.recordings import recording_name, write_recording
+
+SUCCEEDED = Ending(True, "", 70)
+
+
+def test_wilson_interval_matches_its_formula() -> None:
+    z = 1.959963984540054
+    for k, n in ((0, 10), (97, 100), (120, 120)):
+        p, scale = k / n, 1 + z * z / n
+        middle = (p + z * z / (2 * n)) / scale
+        half = z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / scale
+        assert wilson_interval(k, n) == pytest.approx((middle - half, middle + half), abs=1e-9)
+    for k, n in ((0, 0), (3, 2), (-1, 5)):
+        with pytest.raises(ValueError, match="interval"):
+            wilson_interval(k, n)
+
+
+def straight(frames: int, offset: float = 0.0) -> np.ndarray:
+    state = np.zeros((frames, 16))
+    state[:, [6, 14]] = 1.0
+    state[:, 0] = state[:, 8] = np.linspace(0, 1, frames) + offset
+    return state
+
+
+def test_errors_of_a_known_offset() -> None:
+    same = trajectory_error(straight(50), straight(50))
+    assert same.position.max() == 0.0
+    assert same.angle.max() == 0.0
+    assert same.dtw == 0.0
+    moved = trajectory_error(straight(50, 0.02), straight(50))
+    np.testing.assert_allclose(moved.position, 0.02)
+    # Warping forgives what is merely late.
+    late = np.concatenate([straight(50)[:1].repeat(5, 0), straight(50)])
+    assert trajectory_error(late, straight(50)).dtw < 1e-9
+    turned = straight(50)
+    turned[:, 3:7] = [np.sin(0.05), 0, 0, np.cos(0.05)]
+    np.testing.assert_allclose(trajectory_error(turned, straight(50)).angle, 0.05)  # one hand of two by 0.1 rad
+
+
+@pytest.fixture(scope="module")
+def played() -> tuple[BimanualEnv, Trace, Outcome]:
+    """The expert's episode of a seed, judged against itself."""
+    env = BimanualEnv("table_lift")
+    trace, ending = trace_episode(env, Demonstrator(env.task_spec, Noise(0.0)), 940_000)
+    return env, trace, score_episode(env.task_spec, 940_000, trace, Reference.of(trace), ending)
+
+
+def test_the_expert_has_no_error_against_itself(played) -> None:
+    env, trace, outcome = played
+    assert outcome.position_error_cm == 0.0
+    assert outcome.primitives == tuple(p.name for p in env.task_spec.primitives)
+    assert set(outcome.position_error_cm_by_primitive) == set(env.task_spec.labels)
+    assert trace.state.shape == (71, 16)
+    assert trace.joints.shape == (71, 18)
+    assert trace.grip_force.shape == (71, 2)
+    assert (trace.grip_force[0] == 0.0).all()
+    assert (trace.grip_force[30] > 20.0).all(), "the hands hold the table"
+    assert trace.contacts["robot, table"][30]
+    assert not trace.contacts["robot, table"][-1]
+    assert trace.contacts["table, platform"][-1]
+    assert trace.ik_error.max() < 2e-3
+
+
+def test_the_experts_episode_is_played_once(played, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    env, trace, _ = played
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    first = ReferenceCache(env).get(940_000)
+    np.testing.assert_array_equal(first.state, trace.state)
+    monkeypatch.setattr("hdril.evaluation.reference.trace_episode", None)  # playing again would fail
+    again = ReferenceCache(env).get(940_000)
+    np.testing.assert_array_equal(again.state, first.state)
+    np.testing.assert_array_equal(again.scripted, first.scripted)
+
+
+def read_back(path: Path) -> str:
+    rerun = Path(sys.executable).with_name("rerun")
+    subprocess.run([rerun, "rrd", "verify", str(path)], check=True, capture_output=True)
+    return subprocess.run([rerun, "rrd", "print", "-vvv", str(path)], check=True, capture_output=True, text=True).stdout
+
+
+def states(text: str, lane: str) -> set[str]:
+    """States that a lane of a recording takes on; their colours stand in a chunk of their own."""
+    chunks = [chunk for chunk in text.split("entity_path: ")[1:] if chunk.startswith(f"{lane} ")]
+    changes = [chunk for chunk in chunks if "StateChange:state" in chunk]
+    return set(re.findall(r"\[(\w+)\]", " ".join(changes)))
+
+
+def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path: Path) -> None:
+    env, trace, outcome = played
+    failed = replace(outcome, success=False, unmet="table at rest")
+    explanations = [replace(e, primitive=1, attention={"table": 0.5}) if e.primitive == 2 else
+                    replace(e, attention={"table": 1.0}) for e in trace.explanations if e is not None]  # fmt: skip
+    explanations[0] = replace(explanations[0], plan=trace.action[:10])
+    wrong = replace(trace, explanations=tuple(explanations))
+    path = write_recording(tmp_path, EvaluatedEpisode(env, failed, wrong, Reference.of(trace)))
+    assert path.name == "seed_0940000_failure.rrd"
+    assert recording_name(outcome) == "seed_0940000_success"
+    text = read_back(path)
+    for entity in (
+        "/world/table",
+        "/world/platform",
+        "/world/hands/left/commanded",
+        "/world/hands/right/executed",
+        "/world/hands/left/expert_path",
+        "/robot/joints/left_s0",
+        "/primitive/scripted",
+        "/primitive/predicted",
+        "/tracking_error_mm/left",
+        "/planner/grasp",
+        "/primitive/executed",
+        "/from_expert_cm/left",
+        "/attention/table",
+        "/world/hands/right/plan",
+        "/grip_force_N/right",
+        "/ik_error_mm/left",
+        "/contact/robot-table",
+        "/contact/table-platform",
+        "/progress/stage",
+        "/reward",
+        "/summary",
+    ):
+        assert f"entity_path: {entity} " in text, entity
+    assert "failure: table at rest" in text
+    assert not states(text, "/primitive/executed") & {"lift"}
+    assert states(text, "/primitive/scripted") == set(env.task_spec.labels)
+
+
+def test_planner_is_scored_by_frames_and_at_boundaries(played) -> None:
+    """A planner that takes the first frame of lift for move is wrong at one frame of 70 and one boundary of six."""
+    env, trace, _ = played
+    move, lift = (env.task_spec.labels.index(name) for name in ("move", "lift"))
+    first = int(np.flatnonzero(trace.scripted == lift)[0])
+    explanations = list(trace.explanations)
+    explanations[first] = replace(explanations[first], probabilities=np.eye(6)[move])
+    outcome = score_episode(
+        env.task_spec, 0, replace(trace, explanations=tuple(explanations)), Reference.of(trace), SUCCEEDED
+    )
+    assert outcome.planner_confusion[lift][move] == 1
+    assert np.trace(outcome.planner_confusion) == 69
+    assert outcome.planner_boundary_hits == [True, True, False, True, True, True]
+    nobody = replace(trace, explanations=(None,) * len(trace.explanations))
+    assert score_episode(env.task_spec, 0, nobody, Reference.of(trace), SUCCEEDED).planner_confusion == []
+
+
+def test_report_says_what_happened(played, tmp_path: Path) -> None:
+    _, _, outcome = played
+    outcomes = [replace(outcome, seed=s, success=s != 5, unmet="" if s != 5 else "table upright") for s in range(10)]
+    run = Run("table_lift", "somewhere", (), 0, 10, True)
+    write_report(tmp_path, run, outcomes)
+    data = json.loads((tmp_path / "results.json").read_text())
+    assert (data["n_success"], data["n_episodes"], data["pc_success"]) == (9, 10, 90.0)
+    assert data["pc_success_ci95"] == pytest.approx([100 * v for v in wilson_interval(9, 10)])
+    assert data["pc_expert_order"] == 100.0
+    assert data["planner"]["pc_correct"] == data["planner"]["pc_correct_at_boundaries"] == 100.0
+    assert np.array(data["planner"]["confusion"]).sum() == 700
+    assert "9 of 10 succeeded: 90.0 %" in headline(data)
+    text = (tmp_path / "report.md").read_text()
+    assert "table upright (1)" in text
+    assert "| 5 | table upright |" in text
+    assert (tmp_path / "report.png").stat().st_size > 10_000
+
+
+def test_seeds_of_the_training_data_are_refused(dataset: Path, tmp_path: Path) -> None:
+    (tmp_path / "train_config.json").write_text(
+        json.dumps({"dataset": {"repo_id": "hdril/test", "root": str(dataset)}})
+    )
+    provenance = training_provenance(str(tmp_path))
+    assert provenance is not None
+    assert provenance.seeds == (0, 1, 2, 3, 4, 5)
+    assert check_held_out(provenance, "table_lift", [6, 7])
+    with pytest.raises(ValueError, match=r"2 of 4 seeds \(4 to 5\) were in the training data.*a seed above 5"):
+        check_held_out(provenance, "table_lift", [4, 5, 6, 7])
+    with pytest.raises(ValueError, match="trained on the task 'table_lift', not on 'other'"):
+        check_held_out(Provenance(Recipe("table_lift"), (0,)), "other", [9])
+    assert not check_held_out(training_provenance("user/elsewhere"), "table_lift", [0])

@@ -1,0 +1,116 @@
+"""What is particular to peg-in-hole: the halves need each other, and half a connection does not count."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hdril.env import BimanualEnv
+from hdril.geometry import Pose
+from hdril.tasks import get_task, peg_in_hole
+from hdril.tasks.expert import Demonstrator
+from hdril.tasks.peg_in_hole import LEFT, RIGHT, gap, insertion, make_task
+from hdril.tasks.primitives import Grip, Noise, Primitive, carry_each, lift_joined, lower, reach
+
+TASK = get_task("peg_in_hole")
+
+
+def play(seed: int, script: tuple[Primitive, ...], name: str = TASK.name) -> tuple[dict, list[dict], dict[str, Pose]]:
+    """Last info, all infos and the poses at the end, of ``script`` on the scene of ``seed``."""
+    env = BimanualEnv(name)
+    expert = Demonstrator(replace(env.task_spec, primitives=script), Noise(0.0))
+    infos = []
+    with closing(env):
+        observation, info = env.reset(seed=seed)
+        expert.reset(seed)
+        infos.append(info)
+        for _ in range(sum(primitive.frames for primitive in script)):
+            observation, _, _, _, info = env.step(expert.act(observation).action)
+            infos.append(info)
+        poses = {half: env.world.pose(half) for half in (LEFT, RIGHT)}
+        assert gap(env.world) == pytest.approx(info["gap_mm"] / 1e3)
+        assert insertion(env.world) == pytest.approx(info["insertion_mm"] / 1e3)
+    return info, infos, poses
+
+
+@pytest.mark.parametrize("handle", [1.0, -1.0], ids=["outer", "inner"])
+def test_unconnected_halves_cannot_be_lifted_level(handle: float) -> None:
+    """Each hand lifts the half on its side by one of its handles, where it stands."""
+    outer = peg_in_hole._grips(LEFT, RIGHT)
+    grips = {
+        side: Grip(grip.body, Pose(grip.pose.position * (1.0, handle, 1.0), grip.pose.quaternion))
+        for side, grip in outer.items()
+    }
+    for seed in range(950_000, 950_020):
+        info, _, poses = play(seed, (reach("reach", grips), lower("grasp", grips), lift_joined("lift", squeeze=0.0)))
+        assert not info["is_success"]
+        for half, pose in poses.items():
+            tilt = np.rad2deg(np.arccos(pose.rotation_matrix()[2, 2]))
+            assert tilt > 10.0, f"seed {seed}: {half} hangs by {tilt:.1f} degrees and is {pose.position[2]:.3f} m high"
+            assert pose.position[2] > 0.02, f"seed {seed}: {half} was not lifted at all"
+
+
+def test_a_peg_that_is_half_inserted_fails() -> None:
+    held = {"left": LEFT, "right": RIGHT}
+    stop = carry_each("connect", held, peg_in_hole._apart(peg_in_hole.WIDTH / 2 + 0.02, LEFT, RIGHT), 10)
+    for seed in range(951_000, 951_003):
+        info, infos, _ = play(seed, (*TASK.primitives[:-2], stop, TASK.primitives[-1]))
+        assert not info["is_success"]
+        assert "gap" in info["unmet"]
+        assert info["stage"] == [stage.name for stage in TASK.stages].index("peg in the hole") + 1
+        assert max(row["insertion_mm"] for row in infos) > 50.0
+
+
+def test_stages_and_measures_follow_the_expert() -> None:
+    info, infos, _ = play(952_000, TASK.primitives)
+    assert info["is_success"]
+    stages = [row["stage"] for row in infos]
+    assert stages == sorted(stages)
+    assert stages[0] == 0
+    assert stages[-1] == len(TASK.stages) + 1
+    reached = [stages.index(i + 1) for i in range(len(TASK.stages))]
+    ends = np.cumsum([primitive.frames for primitive in TASK.primitives])
+    names = [primitive.name for primitive in TASK.primitives]
+    for frame, name in zip(reached, ("move_left", "move_right", "connect", "connect"), strict=True):
+        start = ends[names.index(name)] - 10
+        assert start < frame <= start + 10, (frame, name)
+    assert infos[-1]["gap_mm"] < 5.0
+    assert infos[-1]["insertion_mm"] > 90.0
+    assert infos[0]["insertion_mm"] == 0.0
+
+
+@pytest.mark.parametrize("name", ["peg_in_hole:clearance=0.008", "peg_in_hole:clearance=0.004,chamfer=0.02"])
+def test_clearance_and_chamfer_can_be_set_with_the_name(name: str) -> None:
+    task = get_task(name)
+    assert task.name == name
+    assert task.bodies != TASK.bodies
+    info, _, _ = play(953_000, task.primitives, name)
+    assert info["is_success"]
+
+
+def test_hole_is_wider_than_the_peg_by_the_clearance() -> None:
+    for clearance in (0.002, 0.005):
+        peg = make_task(clearance).bodies[1].boxes[-1]
+        boxes = make_task(clearance).bodies[2].boxes
+        cheeks = [box for box in boxes if box.size[2] == pytest.approx(peg.size[2] + 2 * clearance)]
+        assert len(cheeks) == 2
+        for cheek in cheeks:
+            assert abs(cheek.centre[0]) - cheek.size[0] / 2 == pytest.approx(peg.size[0] / 2 + clearance)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("peg_in_hole:width=1", "has no parameter 'width'; it has: clearance, chamfer"),
+        ("peg_in_hole:clearance=wide", "clearance must be a number, got 'wide'"),
+        ("peg_in_hole:clearance=0.5", "clearance must be from 0.0005 to 0.02 m, got 0.5"),
+        ("peg_in_hole:chamfer=-1", "chamfer must be from 0 to 0.03 m, got -1"),
+        ("table_lift:clearance=0.005", "table_lift has no parameter 'clearance'; it has: none"),
+    ],
+)
+def test_parameters_are_checked(name: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        get_task(name)

@@ -1,0 +1,207 @@
+"""hdril-view: recordings of runs, of two policies side by side, and of datasets."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.policies.factory import make_policy, make_pre_post_processors
+from lerobot_policy_hdril import HDRILConfig, HDRILPolicy
+
+from hdril.cli.eval import EvalConfig, PolicySource, eval_command
+from hdril.cli.view import ViewConfig, view_command
+from tests.evaluation.test_evaluation import read_back, states
+
+SEED = 2  # of the demonstrations: six of them teach nothing of other places
+
+
+def save(policy: HDRILPolicy, metadata: LeRobotDatasetMetadata, folder: Path) -> Path:
+    policy.save_pretrained(folder)
+    for processor in make_pre_post_processors(policy.config, dataset_stats=metadata.stats):
+        processor.save_pretrained(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Evaluations of a policy that follows the expert, by its linear maps and a trained planner, and of the same with one
+    expert damaged: the weights of lift are zero. Only failures are recorded."""
+    base = tmp_path_factory.mktemp("runs")
+    metadata = LeRobotDatasetMetadata("hdril/test", root=dataset)
+    torch.manual_seed(0)
+    policy = make_policy(HDRILConfig(device="cpu", push_to_hub=False, ridge=1e-4), ds_meta=metadata)
+    train_planner(policy)
+    checkpoints = {"whole": save(policy, metadata, base / "policies/whole")}
+    checkpoints["damaged"] = base / "policies/damaged"
+    run_script("damage.py", checkpoints["whole"], checkpoints["damaged"], "lift")
+    found = {}
+    for name, checkpoint in checkpoints.items():
+        found[name] = base / name / "eval"
+        eval_command(
+            EvalConfig(PolicySource(str(checkpoint)), num_episodes=1, seed=SEED, workers=1, output_dir=found[name],
+                       rerun="failures")
+        )  # fmt: skip
+    return found
+
+
+def run_script(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(Path(__file__).parents[2] / "scripts" / name), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+def train_planner(policy: HDRILPolicy) -> None:
+    optimizer = torch.optim.Adam(policy.planner.parameters(), 5e-3)
+    history = policy._demonstrations.history(torch.arange(0, 420, 70))  # pyright: ignore
+    for _ in range(300):
+        loss, accuracy = policy._planner_loss(history)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert accuracy > 0.99
+
+
+def outcome(run: Path) -> dict:
+    return json.loads((run / "results.json").read_text())["per_episode"][0]
+
+
+def test_recording_of_a_damaged_policy_names_the_primitive_that_failed(runs: dict[str, Path]) -> None:
+    """The same policy with one expert's weights zeroed fails, and everything that tells why points at that primitive."""
+    assert outcome(runs["whole"])["success"]
+    assert outcome(runs["whole"])["departed_in"] == ""
+    damaged = outcome(runs["damaged"])
+    assert not damaged["success"]
+    assert damaged["departed_in"] == "lift"
+    first = 10 + 12  # lift begins after grasp and move
+    assert first <= damaged["departed_frame"] < first + 12
+    (recording,) = (runs["damaged"] / "rerun").iterdir()
+    assert recording.name == f"seed_{SEED:07d}_failure.rrd"
+    text = read_back(recording)
+    assert "more than 2 cm from the expert's path, in lift" in text
+    for entity in ("/primitive/executed", "/planner/lift", "/world/hands/left/plan", "/from_expert_cm/left", "/log"):
+        assert f"entity_path: {entity} " in text
+    assert "lift" in states(text, "/primitive/executed")
+    assert "lift (1)" in (runs["damaged"] / "report.md").read_text()
+
+
+def test_damage_names_what_can_be_damaged(runs: dict[str, Path], tmp_path: Path) -> None:
+    whole = runs["whole"].parents[1] / "policies/whole"
+    done = run_script("damage.py", whole, tmp_path / "x", "juggle")
+    assert done.returncode == 1
+    assert "no model of its own for 'juggle'; there is one for: grasp, move, lift" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_seed_that_was_not_recorded_is_played_again(runs: dict[str, Path], tmp_path: Path, capsys) -> None:
+    assert not (runs["whole"] / "rerun").exists()
+    view_command(ViewConfig(run=runs["whole"], seed=SEED, save=tmp_path / "one.rrd"))
+    assert f"Seed {SEED} was not recorded: playing it again" in capsys.readouterr().out
+    text = read_back(tmp_path / "one.rrd")
+    assert f"seed {SEED}: success" in text
+
+
+def test_two_policies_side_by_side(runs: dict[str, Path], tmp_path: Path) -> None:
+    view_command(ViewConfig(run=runs["whole"], against=runs["damaged"], seed=SEED, save=tmp_path / "both.rrd"))
+    text = read_back(tmp_path / "both.rrd")
+    for player in ("whole", "damaged"):
+        for entity in (
+            "world/table",
+            "world/hands/left/executed",
+            "primitive/executed",
+            "summary",
+        ):
+            assert f"entity_path: /{player}/{entity} " in text
+        for entity in ("joints/left_s0", "baxter/visual_geometries/head/visual_0"):
+            assert f"entity_path: /{player}_robot/{entity} " in text
+    assert "in lift" in text.split("entity_path: /damaged/log")[1].split("entity_path:")[0]
+
+
+def test_recordings_of_a_run_are_saved_as_one_file(runs: dict[str, Path], tmp_path: Path) -> None:
+    view_command(ViewConfig(run=runs["damaged"], save=tmp_path / "all.rrd"))
+    (recording,) = (runs["damaged"] / "rerun").iterdir()
+    assert (tmp_path / "all.rrd").read_bytes() == recording.read_bytes()
+
+
+def test_without_a_display_it_says_what_to_do(runs: dict[str, Path], monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    view_command(ViewConfig(run=runs["damaged"]))
+    text = capsys.readouterr().out
+    assert "There is no display here" in text
+    assert f"rerun {runs['damaged']}/rerun/seed_{SEED:07d}_failure.rrd" in text
+    assert "--web" in text
+
+
+def test_episode_of_a_dataset_is_played_again_with_its_labels(dataset: Path, tmp_path: Path, capsys) -> None:
+    view_command(ViewConfig(dataset=dataset, episode=2, save=tmp_path / "episode.rrd"))
+    assert "seed 2, played again: its states are 0 m or less from the recorded ones" in capsys.readouterr().out
+    text = read_back(tmp_path / "episode.rrd")
+    for entity in ("/primitive/scripted", "/robot/joints/left_s0", "/world/table", "/grip_force_N/left"):
+        assert f"entity_path: {entity} " in text
+    assert states(text, "/primitive/scripted") == {"grasp", "move", "lift", "extend", "place", "retract"}
+
+
+def test_dataset_that_hdril_did_not_record(dataset: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
+    (copy / "meta/hdril.json").unlink()
+    view_command(ViewConfig(dataset=copy, save=tmp_path / "foreign.rrd"))
+    text = read_back(tmp_path / "foreign.rrd")
+    for entity in ("/primitive/scripted", "/action/left_ee.x", "/world/observation.environment_state/table"):
+        assert f"entity_path: {entity} " in text
+
+
+def test_reruns_own_loader_shows_the_labels(dataset: Path, tmp_path: Path) -> None:
+    """``rerun <dataset>``: the dataset opens in Rerun's own LeRobot loader, labels as text."""
+    rerun = Path(sys.executable).with_name("rerun")
+    saved = tmp_path / "loaded.rrd"
+    subprocess.run([rerun, str(dataset), "--save", str(saved)], check=True, capture_output=True, timeout=300)
+    text = read_back(saved)
+    assert "grasp" in text
+    assert "retract" in text
+    assert "observation.state" in text
+
+
+def test_lerobots_viewer_takes_the_dataset(dataset: Path, tmp_path: Path) -> None:
+    program = Path(sys.executable).with_name("lerobot-dataset-viz")
+    subprocess.run(
+        [program, "--repo-id=hdril/test", f"--root={dataset}", "--episode-index=1", "--save=1", "--num-workers=0",
+         f"--output-dir={tmp_path}"],
+        check=True, capture_output=True, timeout=300,
+    )  # fmt: skip
+    (saved,) = tmp_path.glob("*.rrd")
+    text = read_back(saved)
+    for entity in ("/action", "/state", "/next.success"):
+        assert f"entity_path: {entity} " in text
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"run": None}, ValueError, "either --run .* or --dataset"),
+        ({"dataset": Path("x")}, ValueError, "either --run .* or --dataset"),
+        ({"against": Path("x")}, ValueError, "on one seed: give --run and --seed"),
+        ({"run": Path("no/such")}, FileNotFoundError, r"no/such holds no results\.json"),
+        ({"save": Path("x.mp4")}, ValueError, r"must end in \.rrd, got x\.mp4"),
+        ({"run": None, "dataset": Path("no/such")}, FileNotFoundError, "no/such is no LeRobot dataset"),
+    ],
+)
+def test_refusals(change: dict, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        view_command(replace(ViewConfig(run=Path("run")), **change))
+
+
+def test_what_is_not_there_is_named(runs: dict[str, Path], dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=f"show any of its seeds, {SEED} to {SEED}, with --seed"):
+        view_command(ViewConfig(run=runs["whole"]))
+    with pytest.raises(ValueError, match="no episode 6; its episodes are 0 to 5"):
+        view_command(ViewConfig(dataset=dataset, episode=6, save=tmp_path / "x.rrd"))
+    (tmp_path / "there.rrd").touch()
+    with pytest.raises(FileExistsError, match="choose another file"):
+        view_command(ViewConfig(dataset=dataset, save=tmp_path / "there.rrd"))
