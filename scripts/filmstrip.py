@@ -18,14 +18,14 @@ import numpy as np
 
 from hdril.env import BimanualEnv
 from hdril.rollout import transitions
-from hdril.tasks.expert import Demonstrator
+from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.primitives import Noise
 
 
 def frames(task: str, seed: int) -> list[tuple[str, np.ndarray]]:
     """(name, picture) at the end of each primitive."""
     env = BimanualEnv(task, meshes=True)
-    expert = Demonstrator(env.task_spec, Noise(0.0))
+    expert = ScriptedExpert(env.task_spec, Noise(0.0))
     camera = replace(env.task_spec.camera, width=480, height=400)
     ends = np.cumsum([primitive.frames for primitive in env.task_spec.primitives])
     pictures = []

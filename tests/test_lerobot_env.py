@@ -19,7 +19,7 @@ from lerobot_policy_hdril import HDRILConfig
 
 from hdril.lerobot_env import HDRILEnvConfig
 from hdril.tasks import TASKS, get_task
-from hdril.tasks.expert import Demonstrator
+from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.primitives import Noise
 
 
@@ -35,7 +35,7 @@ class Scripted(PreTrainedPolicy):
         placement = self.task.placements[self.task.observed[0]]
         self.middle = 0.5 * (placement.low[0] + placement.high[0])
         self.dummy = torch.nn.Parameter(torch.zeros(1))
-        self.experts: list[tuple[Demonstrator, bool]] = []
+        self.experts: list[tuple[ScriptedExpert, bool]] = []
 
     def reset(self) -> None:
         self.experts = []
@@ -43,7 +43,7 @@ class Scripted(PreTrainedPolicy):
     def select_action(self, batch, **kwargs) -> torch.Tensor:
         states, objects = batch["observation.state"].numpy(), batch["observation.environment_state"].numpy()
         if not self.experts:
-            self.experts = [(Demonstrator(self.task, Noise(0.0)), row[0] > self.middle) for row in objects]
+            self.experts = [(ScriptedExpert(self.task, Noise(0.0)), row[0] > self.middle) for row in objects]
         actions = []
         for (expert, spoiled), state, row in zip(self.experts, states, objects, strict=True):
             action = expert.act({"agent_pos": state, "environment_state": row}).action

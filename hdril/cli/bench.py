@@ -184,13 +184,13 @@ def bench_rerun(task: str, folder: Path) -> Figure:
     from hdril.evaluation.evaluate import EvaluatedEpisode
     from hdril.evaluation.reference import Reference
     from hdril.evaluation.score import score_episode
-    from hdril.tasks.expert import Demonstrator
+    from hdril.tasks.expert import ScriptedExpert
     from hdril.tasks.primitives import Noise
     from hdril.trace import trace_episode
     from hdril.viewer.recordings import write_recording
 
     env = BimanualEnv(task)
-    expert, seconds = Demonstrator(env.task_spec, Noise(0.0)), {"episodes": 0.0, "recording": 0.0}
+    expert, seconds = ScriptedExpert(env.task_spec, Noise(0.0)), {"episodes": 0.0, "recording": 0.0}
     for seed in range(5):
         start = time.perf_counter()
         (trace, ending), (again, _) = (trace_episode(env, expert, seed) for _ in range(2))

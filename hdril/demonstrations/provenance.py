@@ -12,7 +12,7 @@ from hdril import __version__
 from hdril.env import BimanualEnv
 from hdril.simulation.world import Physics
 from hdril.tasks import get_task
-from hdril.tasks.expert import Demonstrator
+from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.primitives import Noise
 
 RECIPE_PATH = "meta/hdril.json"
@@ -49,8 +49,8 @@ class Recipe:
     def make_env(self) -> BimanualEnv:
         return BimanualEnv(self.task, robot=self.robot, physics=self.physics)
 
-    def make_expert(self) -> Demonstrator:
-        return Demonstrator(get_task(self.task), self.noise)
+    def make_expert(self) -> ScriptedExpert:
+        return ScriptedExpert(get_task(self.task), self.noise)
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from hdril.demonstrations.schema import write_dataset
 from hdril.demonstrations.shards import Shelf
 from hdril.env import BimanualEnv
 from hdril.files import MAX_SEED
-from hdril.tasks.expert import Demonstrator
+from hdril.tasks.expert import ScriptedExpert
 
-_worker: tuple[BimanualEnv, Demonstrator] | None = None
+_worker: tuple[BimanualEnv, ScriptedExpert] | None = None
 
 
 def _start_worker(recipe: Recipe) -> None:

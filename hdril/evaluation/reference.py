@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import hdril
 from hdril.env import BimanualEnv
 from hdril.files import cache_folder, write_atomically
-from hdril.tasks.expert import Demonstrator
+from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.primitives import Noise
 from hdril.trace import Trace, trace_episode
 
@@ -38,7 +38,7 @@ class ReferenceCache:
     """
 
     def __init__(self, env: BimanualEnv) -> None:
-        self._env, self._expert = env, Demonstrator(env.task_spec, Noise(0.0))
+        self._env, self._expert = env, ScriptedExpert(env.task_spec, Noise(0.0))
         digest = hashlib.sha256(env.task.encode())
         for file in sorted(Path(hdril.__file__).parent.rglob("*.py")):
             digest.update(file.read_bytes())

@@ -13,7 +13,7 @@ from hdril.tasks.primitives import Hands, Noise, Scene, plan
 from hdril.tasks.task import Task
 
 
-class Demonstrator:
+class ScriptedExpert:
     """Plays a task's primitives in order, planning each from the observation at its first frame.
 
     Its noise comes from ``seed`` alone, so a demonstration can be made again from the task, the seed and ``noise``.

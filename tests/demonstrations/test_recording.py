@@ -19,7 +19,7 @@ from hdril.demonstrations.record import episodes, record
 from hdril.demonstrations.schema import write_dataset
 from hdril.simulation.actions import ACTION_NAMES
 from hdril.tasks import TASKS
-from hdril.tasks.expert import Demonstrator
+from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.primitives import Noise
 
 
@@ -76,7 +76,7 @@ def test_an_episode_can_be_made_again_bit_for_bit(dataset: Path) -> None:
     provenance = read_provenance(dataset)
     assert provenance is not None
     env = provenance.recipe.make_env()
-    episode = demonstrate(env, Demonstrator(env.task_spec, provenance.recipe.noise), provenance.seeds[4])
+    episode = demonstrate(env, ScriptedExpert(env.task_spec, provenance.recipe.noise), provenance.seeds[4])
     env.close()
     data = pd.read_parquet(dataset / "data").query("episode_index == 4")
     for column, ours in (
@@ -97,7 +97,7 @@ def test_same_dataset_for_any_number_of_workers(dataset: Path, tmp_path: Path) -
 
 def test_noise_varies_demonstrations_and_zero_noise_does_not(sample: list[Episode]) -> None:
     env = Recipe("table_lift").make_env()
-    quiet = [demonstrate(env, Demonstrator(env.task_spec, Noise(0.0)), 0) for _ in range(2)]
+    quiet = [demonstrate(env, ScriptedExpert(env.task_spec, Noise(0.0)), 0) for _ in range(2)]
     env.close()
     assert quiet[0].action.tobytes() == quiet[1].action.tobytes()
     difference = np.abs(quiet[0].action - sample[0].action)[:, [0, 1, 2, 8, 9, 10]]

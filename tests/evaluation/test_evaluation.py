@@ -22,7 +22,7 @@ from hdril.evaluation.report import Run, headline, write_report
 from hdril.evaluation.score import Outcome, score_episode
 from hdril.evaluation.statistics import wilson_interval
 from hdril.rollout import Ending
-from hdril.tasks.expert import Demonstrator
+from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.primitives import Noise
 from hdril.trace import Trace, trace_episode
 from hdril.viewer.recordings import recording_name, write_recording
@@ -68,7 +68,7 @@ def test_errors_of_a_known_offset() -> None:
 def played() -> tuple[BimanualEnv, Trace, Outcome]:
     """The expert's episode of a seed, judged against itself."""
     env = BimanualEnv("table_lift")
-    trace, ending = trace_episode(env, Demonstrator(env.task_spec, Noise(0.0)), 940_000)
+    trace, ending = trace_episode(env, ScriptedExpert(env.task_spec, Noise(0.0)), 940_000)
     return env, trace, score_episode(env.task_spec, 940_000, trace, Reference.of(trace), ending)
 
 

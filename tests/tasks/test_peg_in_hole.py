@@ -11,7 +11,7 @@ import pytest
 from hdril.env import BimanualEnv
 from hdril.geometry import Pose
 from hdril.tasks import get_task, peg_in_hole
-from hdril.tasks.expert import Demonstrator
+from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.peg_in_hole import LEFT, RIGHT, gap, insertion, make_task
 from hdril.tasks.primitives import Grip, Noise, Primitive, carry_each, lift_joined, lower, reach
 
@@ -21,7 +21,7 @@ TASK = get_task("peg_in_hole")
 def play(seed: int, script: tuple[Primitive, ...], name: str = TASK.name) -> tuple[dict, list[dict], dict[str, Pose]]:
     """Last info, all infos and the poses at the end, of ``script`` on the scene of ``seed``."""
     env = BimanualEnv(name)
-    expert = Demonstrator(replace(env.task_spec, primitives=script), Noise(0.0))
+    expert = ScriptedExpert(replace(env.task_spec, primitives=script), Noise(0.0))
     infos = []
     with closing(env):
         observation, info = env.reset(seed=seed)

@@ -18,7 +18,7 @@ from hdril.simulation.kinematics import Chain
 from hdril.simulation.robots import SIDES
 from hdril.simulation.world import ROBOT, World
 from hdril.tasks import TASKS, get_task
-from hdril.tasks.expert import Demonstrator
+from hdril.tasks.expert import ScriptedExpert
 
 pytestmark = pytest.mark.parametrize("task", TASKS)
 
@@ -32,7 +32,7 @@ def env(task: str) -> Iterator[BimanualEnv]:
 
 def play(env: BimanualEnv, seed: int, idle: str | None = None, frames: int | None = None) -> tuple[np.ndarray, dict]:
     """The expert's episode; ``idle`` names a hand that stays where it is. States of the world, and the last info."""
-    expert = Demonstrator(env.task_spec)
+    expert = ScriptedExpert(env.task_spec)
     observation, info = env.reset(seed=seed)
     expert.reset(seed)
     rest = observation["agent_pos"].copy()
@@ -111,7 +111,7 @@ def test_nothing_is_moved_by_hand(env: BimanualEnv, monkeypatch: pytest.MonkeyPa
                 return _function(*args, **kwargs)
 
             monkeypatch.setattr(pybullet, name, spy)
-    expert = Demonstrator(env.task_spec)
+    expert = ScriptedExpert(env.task_spec)
     expert.reset(3)
     observation = env._observe()
     done = False
@@ -149,7 +149,7 @@ def test_objects_start_where_the_task_says_and_at_rest(env: BimanualEnv) -> None
 
 
 def test_labels_come_in_the_declared_order(env: BimanualEnv) -> None:
-    expert = Demonstrator(env.task_spec)
+    expert = ScriptedExpert(env.task_spec)
     observation, _ = env.reset(seed=5)
     expert.reset(5)
     labels = []
@@ -165,7 +165,7 @@ def test_labels_come_in_the_declared_order(env: BimanualEnv) -> None:
 
 
 def test_gripper_opens_and_closes_in_the_action(env: BimanualEnv, task: str) -> None:
-    expert = Demonstrator(get_task(task))
+    expert = ScriptedExpert(get_task(task))
     observation, _ = env.reset(seed=1)
     expert.reset(1)
     actions = []
