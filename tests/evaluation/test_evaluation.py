@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +23,7 @@ from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.primitives import Noise
 from hdril.trace import Trace, trace_episode
 from hdril.viewer.recordings import recording_name, write_recording
+from tests.evaluation.rerun_text import read_back, states
 
 SUCCEEDED = Ending(True, "", 70)
 
@@ -97,19 +95,6 @@ def test_the_experts_episode_is_played_once(played, tmp_path: Path, monkeypatch:
     again = ReferenceCache(env).get(940_000)
     np.testing.assert_array_equal(again.state, first.state)
     np.testing.assert_array_equal(again.scripted, first.scripted)
-
-
-def read_back(path: Path) -> str:
-    rerun = Path(sys.executable).with_name("rerun")
-    subprocess.run([rerun, "rrd", "verify", str(path)], check=True, capture_output=True)
-    return subprocess.run([rerun, "rrd", "print", "-vvv", str(path)], check=True, capture_output=True, text=True).stdout
-
-
-def states(text: str, lane: str) -> set[str]:
-    """States that a lane of a recording takes on; their colours stand in a chunk of their own."""
-    chunks = [chunk for chunk in text.split("entity_path: ")[1:] if chunk.startswith(f"{lane} ")]
-    changes = [chunk for chunk in chunks if "StateChange:state" in chunk]
-    return set(re.findall(r"\[(\w+)\]", " ".join(changes)))
 
 
 def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path: Path) -> None:

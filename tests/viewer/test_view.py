@@ -17,7 +17,7 @@ from lerobot_policy_hdril import HDRILConfig, HDRILPolicy
 
 from hdril.cli.eval import EvalConfig, PolicySource, eval_command
 from hdril.cli.view import ViewConfig, view_command
-from tests.evaluation.test_evaluation import read_back, states
+from tests.evaluation.rerun_text import read_back, states
 
 SEED = 2  # of the demonstrations: six of them teach nothing of other places
 
