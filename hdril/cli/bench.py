@@ -12,6 +12,7 @@ from pathlib import Path
 from hdril.cli.common import run
 from hdril.demonstrations.provenance import Recipe
 from hdril.demonstrations.record import record
+from hdril.errors import UserError
 from hdril.simulation.world import World
 from hdril.tasks import get_task
 
@@ -91,7 +92,7 @@ def bench_training(task: str, root: Path, steps: int, output: Path) -> Figure:
     )
     times = re.findall(r"updt_s:([\d.]+) data_s:([\d.]+)", done.stderr + done.stdout)
     if len(times) < 2:
-        raise RuntimeError(f"lerobot-train failed: {done.stderr.strip().splitlines()[-1:]}")
+        raise UserError(f"lerobot-train failed: {done.stderr.strip().splitlines()[-1:]}")
     update = sum(float(u) for u, _ in times[1:])
     data = sum(float(d) for _, d in times[1:])
     return Figure("loader, share of a training step", 100.0 * data / (update + data), 30.0, False, "%")

@@ -1,4 +1,4 @@
-"""What the commands share: parsing, and one-line errors."""
+"""What the commands share: parsing, one-line errors, and the check of a repository's name."""
 
 from __future__ import annotations
 
@@ -11,11 +11,31 @@ from typing import Any
 
 import draccus
 
-EXPECTED = (ValueError, FileExistsError, FileNotFoundError, NotADirectoryError, KeyError, RuntimeError)
+from hdril.errors import UserError
+
+EXPECTED = (UserError, ValueError, OSError)
+"""Failures that the user can mend. Anything else is a bug, and keeps its traceback."""
+
+
+def check_repo_id(option: str, repo_id: str) -> None:
+    """Check the name of a repository on the Hugging Face Hub, without asking the Hub.
+
+    Raises:
+        ValueError: it is not ``user/name`` in the Hub's own terms.
+    """
+    from huggingface_hub.errors import HFValidationError
+    from huggingface_hub.utils import validate_repo_id
+
+    try:
+        validate_repo_id(repo_id)
+    except HFValidationError as error:
+        raise ValueError(f"{option} must look like user/name, got {repo_id!r}: {error}") from None
+    if "/" not in repo_id:
+        raise ValueError(f"{option} must look like user/name, got {repo_id!r}")
 
 
 def _with_underscores(argument: str) -> str:
-    """``--num-episodes=5`` as ``--num_episodes=5``: LeRobot's own commands are of two minds."""
+    """``--num-episodes=5`` as ``--num_episodes=5``: LeRobot's own commands use both."""
     name, equals, value = argument.partition("=")
     return (name[:2] + name[2:].replace("-", "_") + equals + value) if name.startswith("--") else argument
 
@@ -33,7 +53,8 @@ def _switches(arguments: list[str], config_class: type[Any]) -> list[str]:
 def run(program: str, config_class: type[Any], command: Callable[[Any], None]) -> None:
     """Parse the command line and run ``command``; a failure that a user can mend is one line and exit code 2.
 
-    ``HDRIL_DEBUG=1`` shows the traceback instead. Ctrl-C exits with 130.
+    ``HDRIL_DEBUG=1`` shows the traceback instead. Any other exception is a bug: it keeps its traceback, and the exit code is 1.
+    Ctrl-C exits with 130.
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     try:
@@ -53,5 +74,4 @@ def _message(error: BaseException) -> str:
     """What went wrong, on one line. draccus wraps the reason that a config class gives; the reason is what helps."""
     if isinstance(error, draccus.utils.DraccusException) and isinstance(error.__cause__, EXPECTED):
         return _message(error.__cause__)
-    text = error.args[0] if isinstance(error, KeyError) and error.args else error  # KeyError quotes its message
-    return " ".join(str(text).split())
+    return " ".join(str(error).split())

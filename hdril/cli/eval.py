@@ -13,7 +13,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from hdril.cli.common import run
+from hdril.cli.common import check_repo_id, run
 from hdril.evaluation.evaluate import Job, evaluate
 from hdril.evaluation.held_out import check_held_out, training_provenance
 from hdril.evaluation.report import Run, headline, write_report
@@ -64,8 +64,8 @@ class EvalConfig:
 
 def _check(config: EvalConfig) -> None:
     get_task(config.task)
-    if config.push and config.push.count("/") != 1:
-        raise ValueError(f"push must look like user/name, got {config.push!r}")
+    if config.push:
+        check_repo_id("push", config.push)
     for name, least in (("num_episodes", 1), ("seed", 0), ("workers", 1)):
         if getattr(config, name) < least:
             raise ValueError(f"{name} must be at least {least}, got {getattr(config, name)}")

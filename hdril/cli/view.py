@@ -13,6 +13,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from hdril.cli.common import run
+from hdril.errors import UserError
 from hdril.viewer.episodes import Evaluation, compare, replay, show_dataset
 
 MADE = Path("outputs/view")
@@ -94,7 +95,7 @@ def _rerun(*arguments: str, quiet: bool = False) -> None:
     output = subprocess.DEVNULL if quiet else None
     code = subprocess.run([program, *arguments], check=False, stdout=output, stderr=output).returncode
     if code:
-        raise RuntimeError(f"rerun {arguments[0]} ended with exit code {code}")
+        raise UserError(f"rerun {arguments[0]} ended with exit code {code}")
 
 
 def has_display() -> bool:

@@ -19,6 +19,8 @@ from huggingface_hub.errors import (
     RepositoryNotFoundError,
 )
 
+from hdril.errors import UserError
+
 WAITS = (1.0, 4.0, 15.0)
 """Seconds before each repetition."""
 LONGEST_WAIT = 120.0
@@ -38,7 +40,7 @@ _MEANING = {
 _ERRORS = (HfHubHTTPError, httpx.TransportError, LocalTokenNotFoundError, LocalEntryNotFoundError, OfflineModeIsEnabled)
 
 
-class HubError(RuntimeError):
+class HubError(UserError):
     """The Hub could not be reached, or refused."""
 
 
