@@ -47,6 +47,8 @@ class Outcome:
     """First frame at whose end a hand or an object is more than :data:`DEPARTURE` from where the expert has it; -1: none."""
     departed_in: str = ""
     """The primitive that was played then (the expert's, if the policy has none)."""
+    expert_success: bool = True
+    """Whether the expert succeeds on this seed. Where it does not, the errors compare with a failed episode."""
 
 
 def score_episode(task: Task, seed: int, trace: Trace, reference: Reference, ending: Ending) -> Outcome:

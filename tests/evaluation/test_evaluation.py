@@ -13,7 +13,6 @@ from hdril.demonstrations.provenance import Provenance, Recipe
 from hdril.env import BimanualEnv
 from hdril.evaluation.evaluate import EvaluatedEpisode
 from hdril.evaluation.held_out import check_held_out, training_provenance
-from hdril.evaluation.metrics import trajectory_error
 from hdril.evaluation.reference import Reference, ReferenceCache
 from hdril.evaluation.report import Run, headline, write_report
 from hdril.evaluation.score import Outcome, score_episode
@@ -38,28 +37,6 @@ def test_wilson_interval_matches_its_formula() -> None:
     for k, n in ((0, 0), (3, 2), (-1, 5)):
         with pytest.raises(ValueError, match="interval"):
             wilson_interval(k, n)
-
-
-def straight(frames: int, offset: float = 0.0) -> np.ndarray:
-    state = np.zeros((frames, 16))
-    state[:, [6, 14]] = 1.0
-    state[:, 0] = state[:, 8] = np.linspace(0, 1, frames) + offset
-    return state
-
-
-def test_errors_of_a_known_offset() -> None:
-    same = trajectory_error(straight(50), straight(50))
-    assert same.position.max() == 0.0
-    assert same.angle.max() == 0.0
-    assert same.dtw == 0.0
-    moved = trajectory_error(straight(50, 0.02), straight(50))
-    np.testing.assert_allclose(moved.position, 0.02)
-    # Warping forgives what is merely late.
-    late = np.concatenate([straight(50)[:1].repeat(5, 0), straight(50)])
-    assert trajectory_error(late, straight(50)).dtw < 1e-9
-    turned = straight(50)
-    turned[:, 3:7] = [np.sin(0.05), 0, 0, np.cos(0.05)]
-    np.testing.assert_allclose(trajectory_error(turned, straight(50)).angle, 0.05)  # one hand of two by 0.1 rad
 
 
 @pytest.fixture(scope="module")
