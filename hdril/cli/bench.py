@@ -195,7 +195,7 @@ def bench_rerun(task: str, folder: Path) -> Figure:
     for seed in range(5):
         start = time.perf_counter()
         (trace, ending), (again, _) = (trace_episode(env, expert, seed) for _ in range(2))
-        reference = Reference.of(again)
+        reference = Reference.of(again, ending)
         outcome = score_episode(env.task_spec, seed, trace, reference, ending)
         middle = time.perf_counter()
         write_recording(folder, EvaluatedEpisode(env, outcome, trace, reference))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 import hdril
 from hdril.env import BimanualEnv
 from hdril.files import cache_folder, write_atomically
+from hdril.rollout import Ending
 from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.primitives import Noise
 from hdril.trace import Trace, trace_episode
@@ -24,10 +25,15 @@ class Reference:
     state: NDArray[np.float32]  # (T + 1, 16)
     environment_state: NDArray[np.float32]  # (T + 1, 7 per object)
     scripted: NDArray[np.int64]  # (T,), labels
+    success: bool
+    """Whether the expert itself solves this scene. Where it does not, errors against it say nothing about a policy."""
+    unmet: str
+    """The conditions of success that the expert misses; empty if there are none."""
 
     @staticmethod
-    def of(trace: Trace) -> Reference:
-        return Reference(trace.state, trace.environment_state, trace.scripted)
+    def of(trace: Trace, ending: Ending) -> Reference:
+        """The reference that an episode of the expert makes."""
+        return Reference(trace.state, trace.environment_state, trace.scripted, ending.success, ending.unmet)
 
 
 class ReferenceCache:
@@ -49,7 +55,9 @@ class ReferenceCache:
         path = self._folder / f"{seed}.npz"
         if path.exists():
             with np.load(path) as data:
-                return Reference(**data)
-        reference = Reference.of(trace_episode(self._env, self._expert, seed)[0])
+                return Reference(
+                    data["state"], data["environment_state"], data["scripted"], bool(data["success"]), str(data["unmet"])
+                )
+        reference = Reference.of(*trace_episode(self._env, self._expert, seed))
         write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **vars(reference)))
         return reference

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +31,16 @@ class Run:
     overrides: tuple[str, ...]
     first_seed: int
     num_episodes: int
-    held_out: bool
-    """Whether the seeds are known to be apart from the training data."""
+    held_out: bool | None
+    """True: the seeds were checked to be apart from the training data. None: that cannot be told."""
+    held_out_basis: str = ""
+    """What it was checked against, or why it cannot be told: a phrase for reports and cards."""
+    max_frames: int = 0
+    """Frames after which an episode was cut; 0: the task's horizon."""
+    notes: tuple[str, ...] = ()
+    """Sentences that a reader of the results must know."""
+    identity: dict[str, Any] = field(default_factory=dict)
+    """What made the results, see :class:`hdril.evaluation.identity.Identity`."""
 
 
 def summarise(run: Run, outcomes: list[Outcome]) -> dict[str, Any]:
@@ -96,16 +104,16 @@ def headline(summary: dict[str, Any]) -> str:
     """One line: the rate, its interval, n and the seeds."""
     low, high = summary["pc_success_ci95"]
     last = summary["first_seed"] + summary["n_episodes"] - 1
+    budget = f", {summary['max_frames']} frames at most" if summary.get("max_frames") else ""
     return (
         f"{summary['n_success']} of {summary['n_episodes']} succeeded: {summary['pc_success']:.1f} % "
-        f"(95 % interval {low:.1f} to {high:.1f}), seeds {summary['first_seed']} to {last}"
+        f"(95 % interval {low:.1f} to {high:.1f}), seeds {summary['first_seed']} to {last}{budget}"
     )
 
 
 def _markdown(run: Run, outcomes: list[Outcome], summary: dict[str, Any]) -> str:
-    held_out = (
-        "none of them in the training data" if run.held_out else "whether they were in the training data is not known"
-    )
+    held_out = "held out" if run.held_out else "not known to be held out"
+    basis = f" ({run.held_out_basis})" if run.held_out_basis else ""
 
     def spread(key: str, digits: int) -> str:
         return f"{summary[key]['mean']:.{digits}f} ± {summary[key]['std']:.{digits}f}"
@@ -113,8 +121,9 @@ def _markdown(run: Run, outcomes: list[Outcome], summary: dict[str, Any]) -> str
     lines = [
         f"# {run.task}",
         "",
-        f"**{headline(summary)}**, {held_out}.",
+        f"**{headline(summary)}**, {held_out}{basis}.",
         "",
+        *(line for note in run.notes for line in (note, "")),
         f"Policy: `{run.policy}`" + (f" with `{' '.join(run.overrides)}`" if run.overrides else ""),
         "",
         f"![Where episodes succeeded, and how far the hands were from the expert's]({PICTURE})",

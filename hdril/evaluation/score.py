@@ -48,6 +48,8 @@ class Outcome:
     departed_in: str = ""
     """The primitive that was played then (the expert's, if the policy has none)."""
     expert_success: bool = True
+    """Whether the expert solves the scene of this seed. If not, the errors above say nothing about the policy."""
+    expert_success: bool = True
     """Whether the expert succeeds on this seed. Where it does not, the errors compare with a failed episode."""
 
 
@@ -87,6 +89,7 @@ def score_episode(task: Task, seed: int, trace: Trace, reference: Reference, end
         departed_frame=departed,
         departed_in=str(names[doing]) if doing >= 0 else "",
         measures={m.name: round(float(v), 5) for m, v in zip(task.measures, trace.measures[-1], strict=True)},
+        expert_success=reference.success,
     )
 
 

@@ -44,7 +44,7 @@ def played() -> tuple[BimanualEnv, Trace, Outcome]:
     """The expert's episode of a seed, judged against itself."""
     env = BimanualEnv("table_lift")
     trace, ending = trace_episode(env, ScriptedExpert(env.task_spec, Noise(0.0)), 940_000)
-    return env, trace, score_episode(env.task_spec, 940_000, trace, Reference.of(trace), ending)
+    return env, trace, score_episode(env.task_spec, 940_000, trace, Reference.of(trace, ending), ending)
 
 
 def test_the_expert_has_no_error_against_itself(played) -> None:
@@ -81,7 +81,7 @@ def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path:
                     replace(e, attention={"table": 1.0}) for e in trace.explanations if e is not None]  # fmt: skip
     explanations[0] = replace(explanations[0], plan=trace.action[:10])
     wrong = replace(trace, explanations=tuple(explanations))
-    path = write_recording(tmp_path, EvaluatedEpisode(env, failed, wrong, Reference.of(trace)))
+    path = write_recording(tmp_path, EvaluatedEpisode(env, failed, wrong, Reference.of(trace, SUCCEEDED)))
     assert path.name == "seed_0940000_failure.rrd"
     assert recording_name(outcome) == "seed_0940000_success"
     text = read_back(path)
@@ -122,13 +122,13 @@ def test_planner_is_scored_by_frames_and_at_boundaries(played) -> None:
     explanations = list(trace.explanations)
     explanations[first] = replace(explanations[first], probabilities=np.eye(6)[move])
     outcome = score_episode(
-        env.task_spec, 0, replace(trace, explanations=tuple(explanations)), Reference.of(trace), SUCCEEDED
+        env.task_spec, 0, replace(trace, explanations=tuple(explanations)), Reference.of(trace, SUCCEEDED), SUCCEEDED
     )
     assert outcome.planner_confusion[lift][move] == 1
     assert np.trace(outcome.planner_confusion) == 69
     assert outcome.planner_boundary_hits == [True, True, False, True, True, True]
     nobody = replace(trace, explanations=(None,) * len(trace.explanations))
-    assert score_episode(env.task_spec, 0, nobody, Reference.of(trace), SUCCEEDED).planner_confusion == []
+    assert score_episode(env.task_spec, 0, nobody, Reference.of(trace, SUCCEEDED), SUCCEEDED).planner_confusion == []
 
 
 def test_report_says_what_happened(played, tmp_path: Path) -> None:
