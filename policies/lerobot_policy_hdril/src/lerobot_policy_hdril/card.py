@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from huggingface_hub import ModelCard, ModelCardData
+from tabulate import tabulate
 
 from lerobot_policy_hdril.configuration_hdril import HDRILConfig
+from lerobot_policy_hdril.provenance import from_runs
+from lerobot_policy_hdril.schema import RECIPE_PATH
 
 if TYPE_CHECKING:
     from lerobot.configs.train import TrainPipelineConfig
@@ -34,14 +36,8 @@ def simulated_task(dataset_meta: LeRobotDatasetMetadata | None) -> str | None:
     """The task of ``--env.type=hdril`` that a dataset is of; None if hdril did not record it."""
     if dataset_meta is None:
         return None
-    path = Path(dataset_meta.root) / "meta/hdril.json"
+    path = Path(dataset_meta.root) / RECIPE_PATH
     return json.loads(path.read_text())["recipe"]["task"] if path.exists() else None
-
-
-def table(head: tuple[str, ...], rows: Sequence[tuple[object, ...]]) -> str:
-    """Markdown."""
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    return "\n".join([*lines, *("| " + " | ".join(map(str, row)) + " |" for row in rows)])
 
 
 def model_card(
@@ -59,21 +55,9 @@ def model_card(
         tags=sorted({*TAGS, *(tags or [])}),
     )  # fmt: skip
     task = simulated_task(dataset_meta)
-    features = {**(config.input_features or {}), **(config.output_features or {})}
-    names = (config.state_names, config.environment_names, config.action_names)
-    learned = [("dataset", f"[{dataset_repo_id}](https://huggingface.co/datasets/{dataset_repo_id})")]
-    if dataset_meta is not None:
-        learned += [
-            ("episodes", dataset_meta.total_episodes), ("frames", dataset_meta.total_frames),
-            ("frames per second", dataset_meta.fps), ("robot", dataset_meta.robot_type or "not named"),
-        ]  # fmt: skip
-    if training is not None:
-        learned += [("steps", training.steps), ("batch size", training.batch_size), ("seed", training.seed)]
-    lengths = [f"{low}" if low == high else f"{low} to {high}" for low, high in config.primitive_lengths]
     command = (
         f"lerobot-eval --policy.path={repo_id} --env.type=hdril --env.task={task or '<task>'} --eval.n_episodes=100"
     )
-    choices: list[tuple[Any, ...]] = [(f"`{name}`", f"`{getattr(config, name)}`") for name in _CHOICES]
     text = f"""---
 {data.to_yaml()}
 ---
@@ -95,23 +79,15 @@ hdril-eval --policy.path={repo_id} --task={task or "<task>"} --num_episodes=100
 
 ## Inputs and outputs
 
-{
-        table(
-            ("feature", "shape", "numbers"),
-            [
-                (f"`{key}`", tuple(feature.shape), ", ".join(numbers))
-                for (key, feature), numbers in zip(features.items(), names, strict=False)
-            ],
-        )
-    }
+{_features(config)}
 
-{table(("primitive", "frames"), list(zip(config.primitives, lengths, strict=True)))}
+{_primitives(config)}
 
 ## Training
 
-{table(("", ""), learned)}
+{_training(config, dataset_repo_id, training, dataset_meta)}
 
-{table(("option", "value"), choices)}
+{_table(("option", "value"), [(f"`{name}`", f"`{getattr(config, name)}`") for name in _CHOICES])}
 
 {EVALUATION}
 
@@ -126,3 +102,46 @@ hdril-eval --policy.path={repo_id} --task={task or "<task>"} --num_episodes=100
 License: {license}
 """
     return ModelCard(text)
+
+
+def _table(headers: tuple[str, ...], rows: list[tuple[object, ...]]) -> str:
+    return tabulate(rows, headers, tablefmt="github", disable_numparse=True)
+
+
+def _features(config: HDRILConfig) -> str:
+    features = {**(config.input_features or {}), **(config.output_features or {})}
+    names = (config.state_names, config.environment_names, config.action_names)
+    rows: list[tuple[object, ...]] = [
+        (f"`{key}`", tuple(feature.shape), ", ".join(numbers))
+        for (key, feature), numbers in zip(features.items(), names, strict=False)
+    ]
+    return _table(("feature", "shape", "numbers"), rows)
+
+
+def _primitives(config: HDRILConfig) -> str:
+    def length(low: int, high: int) -> str:
+        return f"{low}" if low == high else f"{low} to {high}"
+
+    lengths = [length(*run) if run[1] else "not learned" for run in config.primitive_lengths]
+    return _table(("primitive", "frames"), list(zip(config.primitives, lengths, strict=False)))
+
+
+def _training(
+    config: HDRILConfig,
+    dataset_repo_id: str,
+    training: TrainPipelineConfig | None,
+    dataset_meta: LeRobotDatasetMetadata | None,
+) -> str:
+    rows: list[tuple[object, ...]] = [
+        ("dataset", f"[{dataset_repo_id}](https://huggingface.co/datasets/{dataset_repo_id})")
+    ]
+    if config.training_data:
+        rows.append(("episodes learned from", len(from_runs(config.training_data[-1].episodes))))
+    if dataset_meta is not None:
+        rows += [
+            ("episodes", dataset_meta.total_episodes), ("frames", dataset_meta.total_frames),
+            ("frames per second", dataset_meta.fps), ("robot", dataset_meta.robot_type or "not named"),
+        ]  # fmt: skip
+    if training is not None:
+        rows += [("steps", training.steps), ("batch size", training.batch_size), ("seed", training.seed)]
+    return _table(("", ""), rows)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 from lerobot.configs.policies import PreTrainedConfig
@@ -13,6 +13,8 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_policy_hdril.graph import feature_names
 from lerobot_policy_hdril.presets import PRESETS
+from lerobot_policy_hdril.provenance import TrainingData
+from lerobot_policy_hdril.schema import SUBTASK_KEY
 
 Interaction = Literal["none", "scalar", "object"]
 Decoder = Literal["gru", "ode"]
@@ -39,7 +41,7 @@ class HDRILConfig(PreTrainedConfig):
     # Variant.
     preset: str = ""
     """Name of a model in :data:`~lerobot_policy_hdril.presets.PRESETS`, which then decides the values of this group, and
-    ``hidden_dim`` if that is left at its default; empty to set them one by one."""
+    ``hidden_dim`` unless it is given; empty to set them one by one. Once the policy has learned it is a name only."""
     interaction: Interaction = "object"
     """Graph attention: ``none``; ``scalar``, the paper's node per number of the state; ``object``, a node per object."""
     skip: bool = True
@@ -61,10 +63,10 @@ class HDRILConfig(PreTrainedConfig):
 
     # Rollout.
     rollout: Rollout = "closed_loop"
-    """``closed_loop`` looks again at every re-plan; ``open_loop`` chains predictions from the first state (the paper)."""
+    """``closed_loop`` makes each plan from what is seen; ``open_loop`` chains predictions from the first state (the paper)."""
     replan_every: int = 0
-    """Look again every so many frames within a primitive as well; 0: at its start alone. A policy that was trained with
-    n can be run with 0 and with any multiple of n."""
+    """Make a new plan every so many frames within a primitive as well; 0: at its start alone. A policy that was trained
+    with n can be run with 0 and with any multiple of n."""
 
     # Sizes.
     hidden_dim: int = 128
@@ -80,9 +82,9 @@ class HDRILConfig(PreTrainedConfig):
     state_loss_weight: float = 0.5
     """Weight of the predicted states beside that of the actions."""
     ridge: float = 1.0
-    """Penalty on the squared weights of the linear maps (``state_skip``), which are solved before training."""
+    """Penalty on the squared weights of the linear maps (``state_skip``), which are solved, not trained."""
     min_std: float = 0.01
-    """Floor of the deviations that normalise the data, m or dimensionless: what hardly moves must not dominate."""
+    """Floor of the deviations that normalise the data, m or dimensionless: numbers that hardly vary must not dominate."""
 
     # Optimisation.
     optimizer_lr: float = 1e-3
@@ -92,13 +94,19 @@ class HDRILConfig(PreTrainedConfig):
     scheduler_final_lr: float = 1e-6
 
     # Learned from the dataset; part of the checkpoint.
-    subtask_key: str = "subtask_index"
+    subtask_key: str = SUBTASK_KEY
     """Column of the dataset that labels each frame with its primitive."""
     primitives: list[str] = field(default_factory=list)
     primitive_lengths: list[list[int]] = field(default_factory=list)
-    """Shortest and longest run of each primitive, frames."""
+    """Shortest and longest run of each primitive in the episodes learned from, frames; [0, 0] for a primitive that is in
+    none of them, which is never played. Empty before training."""
+    capacity: int = 0
+    """Frames that a plan has room for: the longest segment of a primitive in the dataset. The size of an array; what is
+    learned comes from the episodes that are learned from."""
+    training_data: list[TrainingData] = field(default_factory=list)
+    """What the policy learned from, dataset by dataset; a record without a digest stands for data that are not known."""
     trained_replan_every: int = -1
-    """``replan_every`` in training, which decides where in a primitive predictions can start; -1 before."""
+    """``replan_every`` in training, which decides where in a primitive plans can start; -1 before."""
     state_names: list[str] = field(default_factory=list)
     environment_names: list[str] = field(default_factory=list)
     action_names: list[str] = field(default_factory=list)
@@ -112,9 +120,19 @@ class HDRILConfig(PreTrainedConfig):
         }
     )
 
+    _given = frozenset[str]()
+    """Names of the values that the constructor was given."""
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> HDRILConfig:
+        """Note which values were given: one that equals the default must count against a preset, too."""
+        config = super().__new__(cls)
+        config._given = frozenset(kwargs)
+        return config
+
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.preset:
+        self._complete_older_checkpoint()
+        if self.preset and not self.primitives:
             self._apply_preset()
         _check_choice("interaction", self.interaction, Interaction)
         _check_choice("decoder", self.decoder, Decoder)
@@ -140,19 +158,24 @@ class HDRILConfig(PreTrainedConfig):
         if self.replan_every < 0:
             raise ValueError(f"policy.replan_every must be 0 (never) or more frames, got {self.replan_every}")
 
+    def _complete_older_checkpoint(self) -> None:
+        """Checkpoints from before ``training_data`` have what they learned from in no record."""
+        if self.primitive_lengths and not self.capacity:
+            self.capacity = max(longest for _, longest in self.primitive_lengths)
+        if self.primitive_lengths and not self.training_data:
+            self.training_data = [TrainingData()]
+
     def _apply_preset(self) -> None:
         if self.preset not in PRESETS:
             raise ValueError(f"unknown policy.preset {self.preset!r}; choose from: {', '.join(PRESETS)}")
-        defaults = {entry.name: entry.default for entry in fields(self)}
         for name, value in PRESETS[self.preset].items():
             given = getattr(self, name)
-            if name == "hidden_dim" and given != defaults[name]:
-                continue
-            if given not in (value, defaults[name]):
+            if name not in self._given:
+                setattr(self, name, value)
+            elif given != value and name != "hidden_dim":
                 raise ValueError(
                     f"policy.preset={self.preset} makes policy.{name} {value!r}, but {given!r} was given; leave out one"
                 )
-            setattr(self, name, value)
 
     def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
         """Learn what each number of state and action is called. LeRobot calls this when it trains.
@@ -176,14 +199,14 @@ class HDRILConfig(PreTrainedConfig):
         """Keep ``replan_every``: training starts.
 
         Raises:
-            ValueError: the checkpoint was trained to look again at other frames.
+            ValueError: the checkpoint was trained to plan at other frames.
         """
         if self.trained_replan_every < 0:
             self.trained_replan_every = self.replan_every
         self.check_replanning()
 
     def check_replanning(self) -> None:
-        """Raises ValueError unless the policy learned to predict from every frame at which it is to look again."""
+        """Raises ValueError unless the policy learned to plan from every frame at which it is to do so."""
         trained, wanted = self.trained_replan_every, self.replan_every
         if trained < 0 or not wanted or (trained and wanted % trained == 0):
             return
@@ -192,19 +215,17 @@ class HDRILConfig(PreTrainedConfig):
             f"policy.replan_every must be {valid}, because the checkpoint was trained with {trained}; got {wanted}"
         )
 
-    def learn_primitives(self, primitives: list[str], lengths: list[list[int]]) -> None:
-        """Keep the dataset's primitives and their lengths.
+    def learn_primitives(self, primitives: list[str], longest: int) -> None:
+        """Keep the names of the dataset's primitives, and make room for the longest of their segments, frames.
 
         Raises:
             ValueError: the checkpoint knows other primitives, or shorter ones: the dataset is of another task.
         """
         self._learn("primitives", primitives)
-        if not self.primitive_lengths:
-            self.primitive_lengths = lengths
-        known, given = max(run[1] for run in self.primitive_lengths), max(run[1] for run in lengths)
-        if given > known:
+        self.capacity = self.capacity or longest
+        if longest > self.capacity:
             raise ValueError(
-                f"the checkpoint predicts {known} frames at most, but a primitive of the dataset has {given}"
+                f"the checkpoint predicts {self.capacity} frames at most, but a primitive of the dataset has {longest}"
             )
 
     def _learn(self, name: str, value: list[str]) -> None:

@@ -1,28 +1,30 @@
 """The dataset's low-dimensional columns, held in memory, and windows of them by frame index.
 
-LeRobot's loader can cut windows itself, through delta timestamps, but at batch 70 it gives 70 to 540 of them a second;
-single frames come at thousands a second, and a gather from memory gives 90,000. So the loader yields single frames, of
-which the policy uses ``index`` alone.
+LeRobot's loader can cut windows itself, through delta timestamps, but at batch 70 it gives 70 to 540 of them a second.
+Single frames come at thousands a second, and a gather from memory gives 90,000. So the loader yields single frames, and
+the policy uses their ``index`` alone.
 """
 
 from __future__ import annotations
 
-import gc
+import hashlib
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
+import pyarrow
 import pyarrow.parquet as parquet
 import torch
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
+from lerobot_policy_hdril.schema import SUBTASK_KEY, SUBTASKS_PATH
+
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-
-SUBTASKS_PATH = "meta/subtasks.parquet"
 
 
 @dataclass(frozen=True)
@@ -58,123 +60,124 @@ def read_primitives(root: Path) -> list[str]:
     path = root / SUBTASKS_PATH
     if not path.exists():
         raise ValueError(f"the dataset has no {SUBTASKS_PATH}: its primitives have no names")
-    table = pd.read_parquet(path).sort_values("subtask_index")
+    table = pd.read_parquet(path).sort_values(SUBTASK_KEY)
     names = table["subtask"] if "subtask" in table.columns else table.index
     return [str(name) for name in names]
 
 
-def _matrix(table, key: str) -> np.ndarray:
-    return np.stack(table.column(key).to_numpy()).astype(np.float32)
+def _read_columns(root: Path, subtask_key: str) -> dict[str, np.ndarray]:
+    """The columns in the order of ``index``; ``state`` is observation.state and environment_state side by side."""
+    files = sorted((root / "data").glob("*/*.parquet"))
+    if not files:
+        raise ValueError(f"{root} holds no data/*/*.parquet")
+    keys = [OBS_STATE, OBS_ENV_STATE, ACTION, subtask_key, "index", "episode_index"]
+    table = parquet.ParquetDataset(files).read(columns=keys)
+    table = table.take(np.argsort(table.column("index").to_numpy(), kind="stable"))
+    columns = {
+        "state": np.concatenate([_matrix(table, OBS_STATE), _matrix(table, OBS_ENV_STATE)], axis=1),
+        "action": _matrix(table, ACTION),
+        "label": table.column(subtask_key).to_numpy().astype(np.int64),
+        "index": table.column("index").to_numpy().astype(np.int64),
+        "episode_index": table.column("episode_index").to_numpy().astype(np.int64),
+    }
+    if not all(np.isfinite(columns[key]).all() for key in ("state", "action")):
+        raise ValueError(f"{root} holds states or actions that are not finite")
+    return columns
 
 
-def selected_episodes(metadata: LeRobotDatasetMetadata) -> list[int] | None:
-    """Episodes that ``--dataset.episodes`` or ``--dataset.eval_split`` leave to train on; None for all.
+def _matrix(table: pyarrow.Table, key: str) -> np.ndarray:
+    return np.stack(list(table.column(key).to_numpy())).astype(np.float32)
 
-    LeRobot gives the policy the metadata of the whole dataset, and tells the choice to the ``LeRobotDataset`` alone, which
-    holds the metadata: so that is looked for among its holders.
-    """
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    holders = gc.get_referrers(metadata)
-    # A holder is the object itself, or the dictionary of its attributes where Python has made one.
-    datasets = [item for item in gc.get_referrers(*holders) + holders if isinstance(item, LeRobotDataset)]
-    chosen = [dataset.episodes for dataset in datasets if dataset.meta is metadata and dataset.episodes is not None]
-    return sorted(chosen[0]) if chosen else None
+def _check_labels(labels: np.ndarray, primitives: list[str]) -> None:
+    if labels.min() < 0 or labels.max() >= len(primitives):
+        raise ValueError(
+            f"labels go from {labels.min()} to {labels.max()}, but {SUBTASKS_PATH} names {len(primitives)}: "
+            f"{', '.join(primitives)}"
+        )
+    if missing := [name for i, name in enumerate(primitives) if not (labels == i).any()]:
+        raise ValueError(f"no frame of the dataset is labelled {', '.join(missing)}; there is nothing to learn it from")
+
+
+def _digest(columns: dict[str, np.ndarray], primitives: list[str]) -> str:
+    """SHA-256 of what the policy reads, whatever the files and the byte order of the machine."""
+    result = hashlib.sha256(json.dumps(primitives).encode())
+    for name in sorted(columns):
+        values = np.ascontiguousarray(columns[name])
+        result.update(f"{name} {values.dtype.name} {values.shape}".encode())
+        result.update(values.astype(values.dtype.newbyteorder("<"), copy=False).data)
+    return result.hexdigest()
 
 
 class Demonstrations:
-    """All frames of a dataset as tensors; ``state`` is observation.state and environment_state side by side.
+    """All frames of a dataset as tensors. Episodes are counted from 0 in the order of their frames.
 
-    ``episodes`` are those to learn from, None for all. The others have windows too, for a loss on held-out episodes, but
-    nothing that is fitted sees them.
+    Nothing here is learned: which episodes are learned from is known when the loader yields their frames, see
+    :mod:`lerobot_policy_hdril.fitting`. Methods that fit anything therefore take a mask (E,) of episodes.
 
     Raises:
         ValueError: labels that are not integers from 0 to the number of primitives - 1, or a primitive with no frames.
     """
 
-    def __init__(
-        self, metadata: LeRobotDatasetMetadata, subtask_key: str, device: str, episodes: list[int] | None = None
-    ) -> None:
+    def __init__(self, metadata: LeRobotDatasetMetadata, subtask_key: str, device: str) -> None:
         root = Path(metadata.root)
         self.primitives = read_primitives(root)
-        columns = [OBS_STATE, OBS_ENV_STATE, ACTION, subtask_key, "index", "episode_index"]
-        files = sorted((root / "data").glob("*/*.parquet"))
-        if not files:
-            raise ValueError(f"{root} holds no data/*/*.parquet")
-        table = parquet.ParquetDataset(files).read(columns=columns)
-        table = table.take(np.argsort(table.column("index").to_numpy(), kind="stable"))
-        labels = table.column(subtask_key).to_numpy()
-        episode_index = table.column("episode_index").to_numpy()
-        learned = np.full(len(labels), True) if episodes is None else np.isin(episode_index, episodes)
-        self._check_labels(labels, labels[learned])
-        new_episode = np.diff(episode_index, prepend=-1) != 0
-        new_segment = new_episode | (np.diff(labels, prepend=-1) != 0)
-        tensors = {
-            "index": table.column("index").to_numpy().astype(np.int64),
-            "state": np.concatenate([_matrix(table, OBS_STATE), _matrix(table, OBS_ENV_STATE)], axis=1),
-            "action": _matrix(table, ACTION),
-            "label": labels.astype(np.int64),
-            "episode": np.cumsum(new_episode) - 1,
-            "segment": np.cumsum(new_segment) - 1,
-            "learned": learned,
-        }
-        if not all(np.isfinite(tensors[key]).all() for key in ("state", "action")):
-            raise ValueError(f"{root} holds states or actions that are not finite")
-        for name, value in tensors.items():
-            setattr(self, name, torch.from_numpy(value).to(device))
-        self._segment_bounds = self._bounds(new_segment, device)  # (segments, 2)
-        self._episode_bounds = self._bounds(new_episode, device)  # (episodes, 2)
-        self.lengths = self._lengths()
-
-    index: Tensor
-    state: Tensor
-    action: Tensor
-    label: Tensor
-    episode: Tensor
-    segment: Tensor
-    learned: Tensor
-    """(frames,), whether the episode is one to learn from."""
-
-    def _check_labels(self, labels: np.ndarray, learned: np.ndarray) -> None:
-        count = len(self.primitives)
-        if labels.min() < 0 or labels.max() >= count:
-            raise ValueError(
-                f"labels go from {labels.min()} to {labels.max()}, but {SUBTASKS_PATH} names {count}: "
-                f"{', '.join(self.primitives)}"
+        columns = _read_columns(root, subtask_key)
+        _check_labels(columns["label"], self.primitives)
+        self.digest = _digest(columns, self.primitives)
+        new_episode = np.diff(columns["episode_index"], prepend=-1) != 0
+        new_segment = new_episode | (np.diff(columns["label"], prepend=-1) != 0)
+        self.episode_index: list[int] = columns["episode_index"][new_episode].tolist()
+        """What the dataset calls each episode."""
+        self.index, self.state, self.action, self.label, self.episode, self.segment = (
+            torch.from_numpy(values).to(device)
+            for values in (
+                columns["index"],
+                columns["state"],
+                columns["action"],
+                columns["label"],
+                np.cumsum(new_episode) - 1,
+                np.cumsum(new_segment) - 1,
             )
-        missing = [name for i, name in enumerate(self.primitives) if not (learned == i).any()]
-        if missing:
-            where = "the dataset" if len(learned) == len(labels) else "the dataset's chosen episodes"
-            raise ValueError(f"no frame of {where} is labelled {', '.join(missing)}; there is nothing to learn it from")
+        )
+        self._segment_bounds = self._bounds(new_segment, device)  # (segments, 2)
+        self._episode_bounds = self._bounds(new_episode, device)  # (E, 2)
+        self.longest = int((self._segment_bounds[:, 1] - self._segment_bounds[:, 0]).max())
+        """Frames of the longest segment."""
 
     @staticmethod
     def _bounds(starts: np.ndarray, device: str) -> Tensor:
         first = np.flatnonzero(starts)
         return torch.from_numpy(np.stack([first, np.append(first[1:], len(starts))], axis=1)).to(device)
 
-    def _lengths(self) -> list[list[int]]:
-        bounds = self._segment_bounds[self.learned[self._segment_bounds[:, 0]]]
+    def lengths(self, episodes: Tensor) -> list[list[int]]:
+        """Shortest and longest run of each primitive in these episodes, frames; [0, 0] for one that is not among them."""
+        bounds = self._segment_bounds[episodes[self.episode[self._segment_bounds[:, 0]]]]
         lengths, labels = bounds[:, 1] - bounds[:, 0], self.label[bounds[:, 0]]
         runs = [lengths[labels == k] for k in range(len(self.primitives))]
-        return [[int(run.min()), int(run.max())] for run in runs]
+        return [[int(run.min()), int(run.max())] if len(run) else [0, 0] for run in runs]
 
-    def look_rows(self, stride: int) -> Tensor:
-        """Rows to learn from at which a rollout looks: every ``stride`` frames of a primitive, or at its start alone if it
-        is 0."""
-        rows = self.learned.nonzero().squeeze(-1)
+    def replan_rows(self, stride: int, episodes: Tensor) -> Tensor:
+        """Rows of these episodes at which a running policy makes a plan: every ``stride`` frames of a primitive, or at its
+        start alone if ``stride`` is 0."""
+        rows = episodes[self.episode].nonzero().squeeze(-1)
         elapsed = rows - self._segment_bounds[self.segment[rows], 0]
         return rows[(elapsed % stride if stride else elapsed) == 0]
 
     def rows(self, index: Tensor) -> Tensor:
-        """Rows of the frames with these values of ``index`` (B,)."""
+        """Rows of the frames with these values of ``index`` (B,).
+
+        Raises:
+            ValueError: the dataset has no such frame.
+        """
         rows = torch.searchsorted(self.index, index)
         if rows.max() >= len(self.index) or not torch.equal(self.index[rows], index):
             raise ValueError("the batch holds frames that the dataset on disk does not have")
         return rows
 
     def window(self, rows: Tensor, stride: int, length: int) -> Window:
-        """Windows of ``length`` frames that the frames belong to. They start where the rollout looks: every ``stride``
-        frames of a primitive, or at its start alone if ``stride`` is 0."""
+        """Windows of ``length`` frames that the frames belong to. They start where a running policy makes a plan: every
+        ``stride`` frames of a primitive, or at its start alone if ``stride`` is 0."""
         bounds = self._segment_bounds[self.segment[rows]]
         first, end = bounds.unbind(-1)
         elapsed = torch.div(rows - first, stride, rounding_mode="floor") * stride if stride else torch.zeros_like(rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
 
 import torch
 from torch import Tensor, nn
@@ -36,27 +37,37 @@ class StateSkip(nn.Module):
     def fit(self, normalised: Tensor, steps: Tensor, target: Tensor, mask: Tensor, ridge: float) -> None:
         """Solve the maps, in float64: W_i minimises sum_n |W_i [s_n || 1] - y_ni|^2 + ridge |W_i|^2, the bias is free.
 
+        A step without a target has the map 0.
+
         Args:
             normalised: states (N, S) at which windows start.
             steps: step numbers (N, M); a window starts at a multiple of the stride.
             target: normalised outputs (N, M, W).
-            mask: (N, M), True where there is a target.
+            mask: (N, M), True where there is a target: the first frames of a row, as many as it has.
             ridge: weight of the penalty; keeps the answer small in directions that the demonstrations do not vary in.
         """
+        self.weight.zero_()
+        self.bias.zero_()
         inputs = torch.cat([normalised, torch.ones_like(normalised[:, :1])], dim=-1).double()
         penalty = ridge * torch.eye(inputs.shape[1], dtype=torch.float64, device=inputs.device)
         penalty[-1, -1] = 1e-6
         for first in steps[:, 0].unique().tolist():
-            mine = (steps[:, 0] == first).nonzero().squeeze(-1)
-            for i in range(steps.shape[1]):
-                rows = mine[mask[mine, i]]
-                if len(rows) == 0:
-                    continue
-                x, y = inputs[rows], target[rows, i].double()
-                solution = torch.linalg.solve(x.T @ x + penalty, x.T @ y).T.to(self.weight)
-                step = int(steps[rows[0], i])
-                self.weight[first // self.stride, step] = solution[:, :-1]
-                self.bias[first // self.stride, step] = solution[:, -1]
+            starts_here = steps[:, 0] == first
+            counts = (mask & starts_here[:, None]).sum(0).tolist()
+            begin = 0
+            for count, columns in groupby(counts):  # steps that the same rows have share their normal equations
+                end = begin + len(list(columns))
+                if count:
+                    rows = (starts_here & mask[:, begin]).nonzero().squeeze(-1)
+                    self._solve(first, begin, end, inputs[rows], target[rows, begin:end].double(), penalty)
+                begin = end
+
+    def _solve(self, first: int, begin: int, end: int, x: Tensor, y: Tensor, penalty: Tensor) -> None:
+        """The maps of the steps ``begin`` to ``end`` of windows that start at ``first``: x (N, S + 1) to y (N, m, W)."""
+        right = torch.einsum("ns,nmw->msw", x, y)
+        solution = torch.linalg.solve(x.T @ x + penalty, right).transpose(1, 2).to(self.weight)  # (m, W, S + 1)
+        row, steps = first // self.stride, slice(first + begin, first + end)
+        self.weight[row, steps], self.bias[row, steps] = solution[..., :-1], solution[..., -1]
 
     def forward(self, normalised: Tensor, steps: Tensor) -> Tensor:
         """States (B, S) and step numbers (B, M), which start at multiples of the stride, to (B, M, W)."""
@@ -113,6 +124,11 @@ class PrimitiveDynamics(nn.Module):
             nn.init.zeros_(self.head[-1].bias)  # pyright: ignore
 
     skip_columns: Tensor
+
+    def fit_state_skip(self, normalised: Tensor, steps: Tensor, target: Tensor, mask: Tensor, ridge: float) -> None:
+        """Solve the linear maps, see :meth:`StateSkip.fit`; nothing to do without them."""
+        if self.state_skip is not None:
+            self.state_skip.fit(normalised, steps, target, mask, ridge)
 
     def forward(
         self, normalised: Tensor, raw: Tensor, context: Tensor, steps: Tensor, samples: int = 0, stacked: bool = False

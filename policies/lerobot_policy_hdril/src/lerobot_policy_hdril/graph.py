@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-POSE_AXES = ("x", "y", "z", "qx", "qy", "qz", "qw")
-QUATERNION_AXES = POSE_AXES[3:]
-PART_SUFFIXES = ("_ee", "_gripper")
+from lerobot_policy_hdril.schema import PART_SUFFIXES, POSE_AXES, QUATERNION_AXES
 
 
 def feature_names(key: str, feature: Mapping[str, Any]) -> list[str]:
