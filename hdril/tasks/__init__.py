@@ -38,20 +38,18 @@ def base_name(name: str) -> str:
     return name.partition(":")[0]
 
 
-def get_task(name: str) -> Task:
-    """The task of that name, with its parameters if there are any: ``name`` or ``name:parameter=number,…``.
+def task_parameters(name: str) -> dict[str, float]:
+    """The parameters of a task: those that ``name`` gives, and the defaults of the others.
 
     Raises:
-        ValueError: unknown name or parameter, or a value that is not a number or out of range; lists the valid ones.
+        ValueError: unknown name or parameter, or a value that is not a number; lists the valid ones.
     """
     base, _, settings = name.partition(":")
     if base not in TASKS:
         raise ValueError(f"unknown task {base!r}; choose from: {', '.join(TASKS)}")
-    if not settings:
-        return TASKS[base]
     known = signature(_BUILDERS[base]).parameters if base in _BUILDERS else {}
-    values: dict[str, float] = {}
-    for setting in settings.split(","):
+    values = {parameter: float(entry.default) for parameter, entry in known.items()}
+    for setting in settings.split(",") if settings else ():
         parameter, _, text = setting.partition("=")
         if parameter not in known:
             raise ValueError(f"{base} has no parameter {parameter!r}; it has: {', '.join(known) or 'none'}")
@@ -59,7 +57,18 @@ def get_task(name: str) -> Task:
             values[parameter] = float(text)
         except ValueError:
             raise ValueError(f"{parameter} must be a number, got {text!r}") from None
-    return replace(_BUILDERS[base](**values), name=name)
+    return values
 
 
-__all__ = ["TASKS", "Task", "Uniform", "base_name", "fixed", "get_task"]
+def get_task(name: str) -> Task:
+    """The task of that name, with its parameters if there are any: ``name`` or ``name:parameter=number,…``.
+
+    Raises:
+        ValueError: unknown name or parameter, or a value that is not a number or out of range; lists the valid ones.
+    """
+    values = task_parameters(name)
+    base = base_name(name)
+    return TASKS[base] if base == name.removesuffix(":") else replace(_BUILDERS[base](**values), name=name)
+
+
+__all__ = ["TASKS", "Task", "Uniform", "base_name", "fixed", "get_task", "task_parameters"]
