@@ -68,19 +68,23 @@ class EndEffectorController:
 
     def apply(self, commands: dict[str, HandCommand]) -> None:
         """Run one control period towards ``commands``."""
-        period = self._world.physics.control_period
         for side, command in commands.items():
-            target = self._base_inverse @ command.pose
-            result = solve_ik(self._chains[side], target, self._arm_targets[side], self._posture[side], self.settings)
-            self.results[side] = result
-            if result.ok:
-                # All joints are slowed alike, so that the hand lags on its path instead of leaving it.
-                step = result.joints - self._arm_targets[side]
-                slowdown = max(1.0, float(np.abs(step / (period * self._max_speeds[side])).max()))
-                self._arm_targets[side] = self._arm_targets[side] + step / slowdown
-        goal = self._joint_targets({side: command.opening for side, command in commands.items()})
-        substeps = self._world.physics.substeps
-        start, done = self._targets, 0
+            self.results[side] = self._aim(side, command.pose)
+        self._ramp(self._joint_targets({side: command.opening for side, command in commands.items()}))
+
+    def _aim(self, side: str, pose: Pose) -> IKResult:
+        """Move an arm's joint targets towards a tool pose (world), or leave them if inverse kinematics fails."""
+        target, start = self._base_inverse @ pose, self._arm_targets[side]
+        result = solve_ik(self._chains[side], target, start, self._posture[side], self.settings)
+        if result.ok:
+            # All joints are slowed alike, so that the hand lags on its path instead of leaving it.
+            step, reach = result.joints - start, self._world.physics.control_period * self._max_speeds[side]
+            self._arm_targets[side] = start + step / max(1.0, float(np.abs(step / reach).max()))
+        return result
+
+    def _ramp(self, goal: NDArray[np.float64]) -> None:
+        """Step the world through one control period while the motor targets move to ``goal``."""
+        substeps, start, done = self._world.physics.substeps, self._targets, 0
         for i in range(1, self.RAMP_STEPS + 1):
             targets = start + (goal - start) * (i / self.RAMP_STEPS)
             targets[self._arm_count :] = goal[self._arm_count :]  # fingers close at their own speed

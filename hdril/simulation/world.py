@@ -11,10 +11,8 @@ import numpy as np
 import pybullet as bullet
 from numpy.typing import NDArray
 
-from hdril.geometry import IDENTITY_QUATERNION, Pose
-
-Vector3 = tuple[float, float, float]
-Colour = tuple[float, float, float, float]
+from hdril.geometry import Pose
+from hdril.simulation.bodies import BodySpec, Vector3
 
 ROBOT = "robot"
 """The name under which every world knows its robot."""
@@ -39,48 +37,6 @@ class Physics:
     def control_period(self) -> float:
         """Seconds between two actions."""
         return self.timestep * self.substeps
-
-
-@dataclass(frozen=True)
-class Box:
-    """A solid box of a compound body: full edge lengths and centre (m), and orientation (xyzw), in the body's frame."""
-
-    size: Vector3
-    centre: Vector3
-    colour: Colour = (0.72, 0.53, 0.36, 1.0)
-    quaternion: tuple[float, float, float, float] = IDENTITY_QUATERNION
-
-
-@dataclass(frozen=True)
-class BodySpec:
-    """A rigid body made of boxes of one density. ``mass`` 0 makes it immovable.
-
-    ``anchored`` asks the solver for friction anchors, which stop a gripped body from creeping through the fingers.
-    """
-
-    name: str
-    boxes: tuple[Box, ...]
-    mass: float = 0.0
-    friction: float = 0.8
-    anchored: bool = True
-
-    @property
-    def centre_of_mass(self) -> NDArray[np.float64]:
-        """(3,), m, body frame."""
-        volumes = np.array([np.prod(box.size) for box in self.boxes])
-        return (volumes[:, None] * np.array([box.centre for box in self.boxes])).sum(0) / volumes.sum()
-
-    @property
-    def inertia(self) -> NDArray[np.float64]:
-        """(3,), kg m²: diagonal of the inertia tensor about the centre of mass, along the body's axes."""
-        volumes = np.array([np.prod(box.size) for box in self.boxes])
-        masses = self.mass * volumes / volumes.sum()
-        total = np.zeros(3)
-        for box, mass in zip(self.boxes, masses, strict=True):
-            size, arm = np.square(box.size), np.square(np.array(box.centre) - self.centre_of_mass)
-            turn = np.square(Pose((0.0, 0.0, 0.0), box.quaternion).rotation_matrix())
-            total += mass * (turn @ (size.sum() - size) / 12.0 + arm.sum() - arm)  # parallel axes
-        return total
 
 
 @dataclass(frozen=True)
@@ -118,7 +74,7 @@ class World:
         if self._client < 0:
             raise RuntimeError("PyBullet gave no physics client; too many worlds are open in this process")
         self._ids: dict[str, int] = {}
-        self._specs: dict[str, BodySpec] = {}
+        self._body_frames: dict[str, Pose] = {}  # of bodies made of boxes, in their inertial frames
         self._joints: dict[str, dict[str, int]] = {}
         self._links: dict[str, dict[str, int]] = {}
         self._link_names: dict[int, dict[int, str]] = {}
@@ -164,28 +120,28 @@ class World:
     def add_body(self, spec: BodySpec, pose: Pose) -> None:
         """Build a compound body from its boxes and put it at ``pose`` (of the body's frame, not of its centre of mass)."""
         self._new(spec.name)
+        inertial, moments = spec.inertial_frame
+        # PyBullet's base frame is the inertial one: its origin the centre of mass, its axes the principal ones.
+        frames = [inertial.inverse() @ Pose(box.centre, box.quaternion) for box in spec.boxes]
+        places, turns = [frame.position.tolist() for frame in frames], [frame.quaternion.tolist() for frame in frames]
         half = [[0.5 * edge for edge in box.size] for box in spec.boxes]
-        com = spec.centre_of_mass
-        # Shapes are given about the body's frame; PyBullet wants them about the centre of mass.
-        centres = [list(np.array(box.centre) - com) for box in spec.boxes]
         shapes = {"shapeTypes": [bullet.GEOM_BOX] * len(half), "halfExtents": half}
-        turns = [box.quaternion for box in spec.boxes]
-        collision = self._call("createCollisionShapeArray", collisionFramePositions=centres,
+        collision = self._call("createCollisionShapeArray", collisionFramePositions=places,
                                collisionFrameOrientations=turns, **shapes)  # fmt: skip
-        visual = self._call("createVisualShapeArray", visualFramePositions=centres, visualFrameOrientations=turns,
+        visual = self._call("createVisualShapeArray", visualFramePositions=places, visualFrameOrientations=turns,
                             rgbaColors=[box.colour for box in spec.boxes], **shapes)  # fmt: skip
-        at = pose @ Pose(com)
+        at = pose @ inertial
         body = self._call("createMultiBody", spec.mass, collision, visual, at.position, at.quaternion)
         dynamics: dict[str, Any] = {"lateralFriction": spec.friction, "frictionAnchor": int(spec.anchored)}
         if spec.mass > 0:
-            # Never asleep: a sleeping body does not survive saveState, and would not feel a slow push.
+            # Never asleep: a sleeping body would not feel a slow push.
             dynamics |= {
-                "localInertiaDiagonal": spec.inertia,
+                "localInertiaDiagonal": moments,
                 "activationState": bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
             }
         self._call("changeDynamics", body, -1, **dynamics)
         self._register(spec.name, body, spec.name)
-        self._specs[spec.name] = spec
+        self._body_frames[spec.name] = inertial.inverse()
 
     def set_link_dynamics(self, body: str, links: Sequence[str], **dynamics: Any) -> None:
         """Forward ``dynamics`` (``lateralFriction``, ``frictionAnchor``, …) to the named links."""
@@ -287,7 +243,7 @@ class World:
     def pose(self, body: str) -> Pose:
         """Frame of a body made of boxes."""
         position, quaternion = self._call("getBasePositionAndOrientation", self._id(body))
-        return Pose(position, quaternion) @ Pose(-self._specs[self._name(body)].centre_of_mass)
+        return Pose(position, quaternion) @ self._body_frames[body]
 
     def velocity(self, body: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Linear (3,), m/s, of the centre of mass, and angular (3,), rad/s."""

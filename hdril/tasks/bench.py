@@ -1,6 +1,6 @@
 """What every scene has: the bench in front of the robot, its top at z = 0."""
 
-from hdril.simulation.world import BodySpec, Box
+from hdril.simulation.bodies import BodySpec, Box
 from hdril.tasks.task import fixed
 
 BENCH_HEIGHT = 0.23

@@ -13,8 +13,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hdril.geometry import Pose
+from hdril.simulation.bodies import BodySpec, Box
 from hdril.simulation.robots.spec import SIDES
-from hdril.simulation.world import BodySpec, Box, Physics, World
+from hdril.simulation.world import Physics, World
 from hdril.tasks.bench import BENCH, BENCH_PLACEMENT
 from hdril.tasks.conditions import Condition, Measure, Stage, lies_at, raised, upright
 from hdril.tasks.primitives import Grip, Grips, Scene, Targets, carry_each, lift_joined, lower, reach, retract

@@ -10,7 +10,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hdril.geometry import Pose
-from hdril.simulation.world import ROBOT, BodySpec, Box
+from hdril.simulation.bodies import BodySpec, Box
+from hdril.simulation.world import ROBOT
 from hdril.tasks.bench import BENCH, BENCH_PLACEMENT
 from hdril.tasks.conditions import at_height, at_rest, not_touching, touching, upright
 from hdril.tasks.primitives import Grip, extend, grasp, lift, move, place, retract

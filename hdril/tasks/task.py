@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hdril.geometry import Pose
-from hdril.simulation.world import BodySpec, Camera, Physics, World
+from hdril.simulation.bodies import BodySpec
+from hdril.simulation.world import Camera, Physics, World
 from hdril.tasks.conditions import Condition, Measure, Stage, failed
 from hdril.tasks.primitives import Primitive
 
