@@ -33,12 +33,12 @@ def dtw_distance(path: NDArray[np.floating], reference: NDArray[np.floating]) ->
     steps of weight 1. The paper of HDR-IL does not define its DTW distance; the two must not be compared.
     """
     # Not dtaidistance's warping_path_fast: it ignores inner_dist and minimises the sum of squares.
-    total, sums = dtw_ndim.warping_paths_fast(
+    sums = dtw_ndim.warping_paths_fast(
         np.ascontiguousarray(path, dtype=np.float64),
         np.ascontiguousarray(reference, dtype=np.float64),
         inner_dist="euclidean",
-    )
-    return float(total) / len(dtw.best_path(sums))
+    )[1]
+    return float(sums[-1, -1]) / len(dtw.best_path(sums))
 
 
 def trajectory_error(state: NDArray[np.floating], reference: NDArray[np.floating]) -> TrajectoryError:

@@ -27,18 +27,6 @@ from tests.evaluation.rerun_text import read_back, states
 SUCCEEDED = Ending(True, "", 70)
 
 
-def test_wilson_interval_matches_its_formula() -> None:
-    z = 1.959963984540054
-    for k, n in ((0, 10), (97, 100), (120, 120)):
-        p, scale = k / n, 1 + z * z / n
-        middle = (p + z * z / (2 * n)) / scale
-        half = z * np.sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / scale
-        assert wilson_interval(k, n) == pytest.approx((middle - half, middle + half), abs=1e-9)
-    for k, n in ((0, 0), (3, 2), (-1, 5)):
-        with pytest.raises(ValueError, match="interval"):
-            wilson_interval(k, n)
-
-
 @pytest.fixture(scope="module")
 def played() -> tuple[BimanualEnv, Trace, Outcome]:
     """The expert's episode of a seed, judged against itself."""

@@ -43,7 +43,7 @@ def optimal_path(a: Path3, b: Path3) -> list[tuple[int, int]]:
 
 @pytest.mark.parametrize("frames", [10, 70, 700])
 def test_dtw_of_an_offset_across_the_path_is_the_offset_at_any_length(frames: int) -> None:
-    moved = line(frames) + [0.0, 0.006, 0.008]
+    moved = line(frames) + np.array([0.0, 0.006, 0.008])
     assert dtw_distance(moved, line(frames)) == pytest.approx(0.01, rel=1e-9)
 
 
@@ -69,7 +69,7 @@ def test_dtw_is_symmetric_and_at_most_the_frame_by_frame_error() -> None:
 
 
 def test_each_hand_counts_for_half() -> None:
-    error = trajectory_error(states(line(30) + [0, 0.02, 0], line(30)), states(line(30), line(30)))
+    error = trajectory_error(states(line(30) + np.array([0, 0.02, 0]), line(30)), states(line(30), line(30)))
     np.testing.assert_allclose(error.position, 0.01)
     assert error.dtw == pytest.approx(0.01)
     np.testing.assert_array_equal(error.angle, 0.0)

@@ -1,0 +1,169 @@
+"""Intervals, paired tests, and the spread over trainings."""
+
+from __future__ import annotations
+
+from dataclasses import astuple
+from math import comb, sqrt
+
+import numpy as np
+import pytest
+
+from hdril.evaluation.statistics import (
+    PairedCounts,
+    TrainingSpread,
+    holm,
+    mcnemar_exact,
+    most_discordant,
+    paired_counts,
+    paired_difference_interval,
+    wilson_interval,
+)
+
+Z = 1.959963984540054
+TABLES = [PairedCounts(*counts) for counts in ((36, 12, 2, 0), (150, 20, 8, 22), (60, 3, 3, 34), (5, 0, 9, 6))]
+
+
+def exchanged(counts: PairedCounts) -> PairedCounts:
+    return PairedCounts(counts.both, counts.second_only, counts.first_only, counts.neither)
+
+
+def wilson_by_hand(k: int, n: int, z: float = Z) -> tuple[float, float]:
+    p, scale = k / n, 1 + z * z / n
+    middle = (p + z * z / (2 * n)) / scale
+    half = z * sqrt(p * (1 - p) / n + z * z / (4 * n * n)) / scale
+    return middle - half, middle + half
+
+
+@pytest.mark.parametrize(("k", "n"), [(0, 10), (97, 100), (120, 120)])
+def test_wilson_interval_matches_its_formula(k: int, n: int) -> None:
+    assert wilson_interval(k, n) == pytest.approx(wilson_by_hand(k, n), abs=1e-9)
+    assert wilson_interval(k, n, confidence=0.6826894921) == pytest.approx(wilson_by_hand(k, n, 1.0), abs=1e-6)
+
+
+@pytest.mark.parametrize(("k", "n"), [(0, 0), (3, 2), (-1, 5)])
+def test_impossible_counts_have_no_interval(k: int, n: int) -> None:
+    with pytest.raises(ValueError, match=f"got {k} of {n}"):
+        wilson_interval(k, n)
+
+
+# ---------------------------------------------------------------------- pairs
+
+
+def test_pairs_are_counted_by_seed() -> None:
+    first = {1: True, 2: True, 3: False, 4: False, 5: True, 6: True}
+    second = {6: True, 5: False, 4: False, 3: True, 2: False, 1: False}
+    assert paired_counts(first, second) == PairedCounts(both=1, first_only=3, second_only=1, neither=1)
+    assert paired_counts(first, second).trials == 6
+    assert paired_counts(first, second).difference == pytest.approx(2 / 6)
+
+
+def test_outcomes_of_other_seeds_are_not_pairs() -> None:
+    with pytest.raises(ValueError, match=r"2 are in one of the two alone, e\.g\. 1"):
+        paired_counts({1: True, 2: True}, {2: True, 3: True})
+    with pytest.raises(ValueError, match="not all 0"):
+        paired_counts({}, {})
+    with pytest.raises(ValueError, match="at least 0"):
+        PairedCounts(3, -1, 2, 4)
+
+
+@pytest.mark.parametrize(("b", "c"), [(1, 0), (6, 0), (12, 2), (7, 5)])
+def test_mcnemar_is_twice_the_binomial_tail_of_the_discordant_pairs(b: int, c: int) -> None:
+    tail = sum(comb(b + c, k) for k in range(min(b, c) + 1)) / 2 ** (b + c)
+    for concordant in ((10, 3), (0, 0)):
+        counts = PairedCounts(concordant[0], b, c, concordant[1])
+        assert mcnemar_exact(counts) == pytest.approx(min(1.0, 2 * tail))
+        assert mcnemar_exact(exchanged(counts)) == mcnemar_exact(counts)
+
+
+@pytest.mark.parametrize("counts", [PairedCounts(10, 0, 0, 3), PairedCounts(4, 5, 5, 1)])
+def test_policies_that_no_pair_tells_apart_have_p_one(counts: PairedCounts) -> None:
+    assert mcnemar_exact(counts) == 1.0
+
+
+def test_margins_alone_bound_the_p_value() -> None:
+    for first in range(9):
+        for second in range(9):
+            worst = most_discordant(first, second, 8)
+            assert (worst.both + worst.first_only, worst.both + worst.second_only, worst.trials) == (first, second, 8)
+            possible = [
+                mcnemar_exact(PairedCounts(both, first - both, second - both, 8 - first - second + both))
+                for both in range(max(0, first + second - 8), min(first, second) + 1)
+            ]
+            assert mcnemar_exact(worst) == pytest.approx(max(possible))
+    for first, second in ((9, 2), (2, 9), (-1, 2), (2, -1)):
+        with pytest.raises(ValueError, match=f"from 0 to 8, got {first} and {second}"):
+            most_discordant(first, second, 8)
+
+
+def test_difference_interval_is_newcombes() -> None:
+    """Tables of Newcombe (1998) have 0.0569 to 0.3404 for 36, 12, 2, 0 by method 10."""
+    assert paired_difference_interval(TABLES[0]) == pytest.approx((0.0569, 0.3404), abs=5e-5)
+
+
+@pytest.mark.parametrize("counts", TABLES, ids=str)
+def test_difference_interval_matches_its_formula(counts: PairedCounts) -> None:
+    a, b, c, d = astuple(counts)
+    n = a + b + c + d
+    p, q = (a + b) / n, (a + c) / n
+    (l1, u1), (l2, u2) = wilson_by_hand(a + b, n), wilson_by_hand(a + c, n)
+    product = a * d - b * c
+    corrected = product - n / 2 if product > n / 2 else min(product, 0)
+    phi = corrected / sqrt((a + b) * (c + d) * (a + c) * (b + d))
+    low = p - q - sqrt((p - l1) ** 2 - 2 * phi * (p - l1) * (u2 - q) + (u2 - q) ** 2)
+    high = p - q + sqrt((u1 - p) ** 2 - 2 * phi * (u1 - p) * (q - l2) + (q - l2) ** 2)
+    assert paired_difference_interval(counts) == pytest.approx((low, high), abs=1e-9)
+
+
+@pytest.mark.parametrize("counts", [*TABLES, PairedCounts(50, 0, 0, 0), PairedCounts(0, 9, 0, 0)], ids=str)
+def test_exchange_of_the_policies_negates_the_difference(counts: PairedCounts) -> None:
+    low, high = paired_difference_interval(counts)
+    assert -1.0 <= low <= counts.difference <= high <= 1.0
+    assert paired_difference_interval(exchanged(counts)) == pytest.approx((-high, -low))
+    wider = paired_difference_interval(counts, confidence=0.99)
+    assert wider[0] <= low
+    assert high <= wider[1]
+    assert wider[1] - wider[0] > high - low
+
+
+def test_equal_policies_without_failures_may_still_differ_a_little() -> None:
+    low, high = paired_difference_interval(PairedCounts(200, 0, 0, 0))
+    assert high == pytest.approx(1.0 - wilson_by_hand(200, 200)[0])
+    assert low == pytest.approx(-high)
+
+
+@pytest.mark.parametrize("p", [(0.50, 0.20, 0.10, 0.20), (0.45, 0.08, 0.04, 0.43)])
+def test_difference_interval_covers_the_truth_as_often_as_it_says(p: tuple[float, ...]) -> None:
+    draws = np.random.default_rng(0).multinomial(60, p, size=1000)
+    tables, times = np.unique(draws, axis=0, return_counts=True)
+    intervals = [paired_difference_interval(PairedCounts(*map(int, table))) for table in tables]
+    covered = [low <= p[1] - p[2] <= high for low, high in intervals]
+    assert 0.93 <= np.average(covered, weights=times) <= 0.98
+
+
+def test_holm_multiplies_the_smallest_most_and_never_reverses_an_order() -> None:
+    assert holm([0.01, 0.04, 0.03, 0.5]) == pytest.approx([0.04, 0.09, 0.09, 0.5])
+    assert holm([0.02]) == [0.02]
+    assert holm([0.9, 0.8]) == [1.0, 1.0]
+    assert holm([]) == []
+
+
+# ------------------------------------------------------------------ trainings
+
+
+def test_trainings_are_not_pooled() -> None:
+    spread = TrainingSpread((200, 190, 180), 200)
+    assert spread.rates == (1.0, 0.95, 0.9)
+    assert spread.mean == pytest.approx(0.95)
+    assert spread.sd == pytest.approx(0.05)
+    assert str(spread) == "3 × 200: 95.0 % (90.0 to 100.0, SD 5.0)"
+
+
+def test_one_training_has_no_spread() -> None:
+    assert TrainingSpread((3,), 4).sd == 0.0
+    assert str(TrainingSpread((0,), 1)) == "1 × 1: 0.0 % (0.0 to 0.0, SD 0.0)"
+
+
+@pytest.mark.parametrize(("successes", "trials"), [((), 5), ((6,), 5), ((3, -1), 5), ((0,), 0)])
+def test_impossible_trainings_are_refused(successes: tuple[int, ...], trials: int) -> None:
+    with pytest.raises(ValueError, match=f"from 0 to {trials} successes"):
+        TrainingSpread(successes, trials)
