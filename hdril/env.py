@@ -21,15 +21,17 @@ SETTLE_PERIODS = 2
 
 
 class BimanualEnv(gym.Env):
-    """World x task x end-effector control, 10 actions a second.
+    """A world, a task and a controller of the hands: 10 actions a second.
 
     Observation: ``agent_pos`` (16,), measured hand poses and openings; ``environment_state`` (7 per observed object).
     Action (16,): hand poses and openings to reach, in the same order (:data:`~hdril.simulation.actions.ACTION_NAMES`);
-    quaternions are normalised, openings clipped to [0, 1]. Reward: 1 on success. ``info["is_success"]`` is judged from the task's
-    horizon on; the episode ends then with success, and at ``max_episode_steps`` (the horizon unless given) anyway.
+    quaternions are normalised, openings clipped to [0, 1].
+
+    Success is judged at every frame from the task's horizon on. The first success ends the episode with a reward of 1. An
+    episode without one is cut after ``max_episode_steps`` frames, which are the horizon unless more are given.
 
     Raises:
-        ValueError: unknown task, robot or render mode.
+        ValueError: unknown task, robot or render mode, or ``max_episode_steps`` below the horizon.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 10}  # pyright: ignore
@@ -43,14 +45,12 @@ class BimanualEnv(gym.Env):
         meshes: bool = False,
         physics: Physics | None = None,
     ) -> None:
-        if robot not in ROBOTS:
-            raise ValueError(f"unknown robot {robot!r}; choose from: {', '.join(ROBOTS)}")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"unknown render mode {render_mode!r}; choose from: rgb_array")
-        self.task_spec, self.robot_spec = get_task(task), ROBOTS[robot]
+        self.task_spec, self.robot_spec = get_task(task), ROBOTS.find(robot)
         self.task, self.task_description = self.task_spec.name, self.task_spec.description
         self.render_mode = render_mode
-        self._max_episode_steps = max_episode_steps or self.task_spec.horizon
+        self._max_episode_steps = self.task_spec.episode_limit(max_episode_steps, "max_episode_steps")
         self._physics, self._meshes = physics or self.task_spec.physics, meshes
         self._world: World | None = None
         self.controller = EndEffectorController(self.robot_spec)

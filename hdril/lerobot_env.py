@@ -1,4 +1,4 @@
-"""hdril's tasks for LeRobot: the environment type ``hdril`` and the gym ids."""
+"""hdril's tasks for LeRobot: the environment type ``hdril``."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from hdril.env import BimanualEnv
 from hdril.simulation.actions import ACTION_NAMES
-from hdril.tasks import TASKS, get_task
-
-for _task in TASKS.values():
-    gym.register(id=_task.gym_id, entry_point="hdril.env:BimanualEnv", kwargs={"task": _task.name})
+from hdril.simulation.robots import ROBOTS
+from hdril.tasks import get_task
 
 
 @EnvConfig.register_subclass("hdril")
 @dataclass
 class HDRILEnvConfig(EnvConfig):
-    """``--env.type=hdril --env.task=…``. An unknown task is named by :meth:`create_envs`: draccus would swallow the reason
-    of an error that is raised here."""
+    """The options of ``--env.type=hdril``.
+
+    :meth:`create_envs` refuses what is not valid. draccus would swallow the reason of an error that is raised earlier.
+    """
 
     task: str | None = "table_lift"
     robot: str = "baxter"
     fps: int = BimanualEnv.metadata["render_fps"]
     episode_length: int | None = None
-    """Frames before an episode is cut; the task's horizon unless given."""
+    """Frames after which an episode is cut; the task's horizon unless given, and no fewer."""
     meshes: bool = False
-    """Draw the robot's meshes in videos instead of simple shapes: ten times as slow."""
+    """Draw the robot's meshes in videos instead of simple shapes, which is ten times as slow."""
     rerun: str = "none"
-    """Episodes to keep as Rerun recordings: failures, all, none, or a number of episodes from an environment's first on.
-    hdril-eval also records what the policy planned and believed, which an environment does not see."""
+    """Episodes to keep as Rerun recordings: failures, all, none, or the number of episodes to keep of each environment.
+    hdril-eval also records the policy's plans and probabilities, which an environment does not see."""
     rerun_dir: str = "outputs/rerun"
-    """Folder of the recordings, a file each."""
+    """Folder of the recordings, one file for each episode."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(
         default_factory=lambda: {ACTION: ACTION, "agent_pos": OBS_STATE, "environment_state": OBS_ENV_STATE}
@@ -68,16 +68,17 @@ class HDRILEnvConfig(EnvConfig):
 
     @property
     def recordings(self) -> dict[str, str]:
-        """What :func:`make_env` wants to know of Rerun recordings."""
+        """The options of :func:`make_env` for Rerun recordings."""
         return {"keep": self.rerun, "folder": self.rerun_dir}
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
-        """One vector environment, as LeRobot wants it. Raises ValueError if the task or ``rerun`` is not a valid one.
+        """One vector environment, by type and index, as LeRobot expects.
 
-        Workers of an asynchronous one get a factory of this module, so that they import it: a gym id alone would not
-        be known to them.
+        Raises:
+            ValueError: ``task``, ``robot`` or ``rerun`` is not valid, or ``episode_length`` is below the task's horizon.
         """
-        get_task(self.task or "")
+        ROBOTS.find(self.robot)
+        get_task(self.task or "").episode_limit(self.episode_length, "env.episode_length")
         if self.rerun != "none":
             from hdril.viewer.keep import check_keep
 
@@ -92,12 +93,12 @@ class HDRILEnvConfig(EnvConfig):
 
 
 def make_env(task: str, recordings: dict[str, str], **kwargs) -> gym.Env:
-    """An environment that stops simulating once its episode is over, and writes Rerun recordings if it is told to."""
+    """An environment that stops simulating once its episode is over, and writes Rerun recordings if it is asked to."""
     from lerobot.envs.utils import FreezeAfterEpisodeEnd
 
     env: gym.Env = BimanualEnv(task, **kwargs)
     if recordings["keep"] != "none":
-        # Here and not above: LeRobot imports this module at each of its commands' start.
+        # LeRobot imports this module at the start of each of its commands: Rerun is imported only if it is needed.
         from hdril.viewer.recorded_environment import RecordedEpisodes
 
         env = RecordedEpisodes(env, recordings["keep"], Path(recordings["folder"]))  # pyright: ignore

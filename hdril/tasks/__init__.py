@@ -1,35 +1,48 @@
-"""Tasks by name. To add one, add a module here that defines ``TASK``: it is found by itself.
+"""Tasks by name: those of this package, and those of other packages.
 
-A module may also define ``make_task``, with a default for every parameter: these can then be set with the name, as in
-``peg_in_hole:clearance=0.003``, wherever a task's name is taken.
+To add a task here, add a module that defines ``TASK``: it is found by itself. The module may also define ``make_task``, with
+a default for every parameter. The parameters can then be set with the name, as in ``peg_in_hole:clearance=0.003``, wherever a
+task's name is taken.
+
+Another package adds a task with such a module of its own, and an entry point of the group ``hdril.tasks`` that names the
+module. The name of the entry point must be the name of the task::
+
+    [project.entry-points."hdril.tasks"]
+    stack_cups = "my_package.stack_cups"
 """
 
-from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 from inspect import signature
 from pkgutil import iter_modules
+from types import ModuleType
 
+from hdril.plugins import Registry
 from hdril.tasks.task import Task, Uniform, fixed
 
 
-def _discover() -> tuple[dict[str, Task], dict[str, Callable[..., Task]]]:
-    tasks: dict[str, Task] = {}
-    builders: dict[str, Callable[..., Task]] = {}
-    for found in iter_modules(__path__):
-        module = import_module(f"{__name__}.{found.name}")
+def _discover() -> dict[str, ModuleType]:
+    """The modules here that define a task, by the task's name. An error in a module is raised, not skipped."""
+    found: dict[str, ModuleType] = {}
+    for info in iter_modules(__path__):
+        module = import_module(f"{__name__}.{info.name}")
         task = getattr(module, "TASK", None)
         if task is None:
             continue
-        if task.name in tasks:
-            raise ValueError(f"two tasks are named {task.name!r}")
-        tasks[task.name] = task
-        if hasattr(module, "make_task"):
-            builders[task.name] = module.make_task
-    return tasks, builders
+        if task.name in found:
+            raise ValueError(f"two tasks are named {task.name!r}: {found[task.name].__name__} and {module.__name__}")
+        found[task.name] = module
+    return found
 
 
-TASKS, _BUILDERS = _discover()
+def _read(module: object) -> Task:
+    task = getattr(module, "TASK", None)
+    if not isinstance(task, Task):
+        raise TypeError(f"{getattr(module, '__name__', module)} defines no TASK of type hdril.tasks.Task")
+    return task
+
+
+TASKS: Registry[Task] = Registry("task", "hdril.tasks", _discover(), _read)
 """Tasks by name, with the defaults of their parameters."""
 
 
@@ -38,37 +51,29 @@ def base_name(name: str) -> str:
     return name.partition(":")[0]
 
 
-def task_parameters(name: str) -> dict[str, float]:
-    """The parameters of a task: those that ``name`` gives, and the defaults of the others.
+def get_task(name: str) -> Task:
+    """The task of that name, with its parameters if there are any: ``name`` or ``name:parameter=number,…``.
 
     Raises:
-        ValueError: unknown name or parameter, or a value that is not a number; lists the valid ones.
+        ValueError: unknown name or parameter, or a value that is not a number or out of range; lists the valid ones. Also
+            if the task is from another package and cannot be imported (:class:`~hdril.plugins.PluginError`).
     """
     base, _, settings = name.partition(":")
-    if base not in TASKS:
-        raise ValueError(f"unknown task {base!r}; choose from: {', '.join(TASKS)}")
-    known = signature(_BUILDERS[base]).parameters if base in _BUILDERS else {}
-    values = {parameter: float(entry.default) for parameter, entry in known.items()}
-    for setting in settings.split(",") if settings else ():
+    task = TASKS.find(base)
+    if not settings:
+        return task
+    build = getattr(TASKS.source(base), "make_task", None)
+    known = signature(build).parameters if build else {}
+    values: dict[str, float] = {}
+    for setting in settings.split(","):
         parameter, _, text = setting.partition("=")
-        if parameter not in known:
+        if build is None or parameter not in known:
             raise ValueError(f"{base} has no parameter {parameter!r}; it has: {', '.join(known) or 'none'}")
         try:
             values[parameter] = float(text)
         except ValueError:
             raise ValueError(f"{parameter} must be a number, got {text!r}") from None
-    return values
+    return replace(build(**values), name=name) if build else task
 
 
-def get_task(name: str) -> Task:
-    """The task of that name, with its parameters if there are any: ``name`` or ``name:parameter=number,…``.
-
-    Raises:
-        ValueError: unknown name or parameter, or a value that is not a number or out of range; lists the valid ones.
-    """
-    values = task_parameters(name)
-    base = base_name(name)
-    return TASKS[base] if base == name.removesuffix(":") else replace(_BUILDERS[base](**values), name=name)
-
-
-__all__ = ["TASKS", "Task", "Uniform", "base_name", "fixed", "get_task", "task_parameters"]
+__all__ = ["TASKS", "Task", "Uniform", "base_name", "fixed", "get_task"]

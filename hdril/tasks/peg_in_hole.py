@@ -168,7 +168,6 @@ def make_task(clearance: float = 0.005, chamfer: float = 0.0) -> Task:
     frames = 10
     return Task(
         name="peg_in_hole",
-        gym_id="hdril/PegInHole-v0",
         description="Put the two half tables together, peg in hole, and lift them as one.",
         bodies=(
             BENCH,

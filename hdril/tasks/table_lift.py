@@ -48,7 +48,6 @@ GRIPS = {
 
 TASK = Task(
     name="table_lift",
-    gym_id="hdril/TableLift-v0",
     description="Lift the table with both hands and set it down upright on the platform.",
     bodies=(BENCH, TABLE, PLATFORM),
     placements={

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -28,6 +29,12 @@ class Uniform:
         return Pose(rng.uniform(self.low, self.high))
 
 
+def gym_id(task: str) -> str:
+    """Gymnasium's id of a task, from its name: ``table_lift`` is ``hdril/TableLift-v0``."""
+    words = re.findall(r"[A-Za-z0-9]+", task.partition(":")[0])
+    return f"hdril/{''.join(word[0].upper() + word[1:] for word in words)}-v0"
+
+
 @dataclass(frozen=True)
 class Task:
     """A scene, the primitives that solve it, and what counts as success, as data.
@@ -38,7 +45,7 @@ class Task:
     """
 
     name: str
-    gym_id: str
+    """Lower case, words joined by underscores, and parameters after a colon: ``peg_in_hole:clearance=0.003``."""
     description: str
     """The instruction, in words: LeRobot's ``task``."""
     bodies: tuple[BodySpec, ...]
@@ -60,6 +67,11 @@ class Task:
             raise ValueError(f"task {self.name}: no placement for {', '.join(sorted(missing))}")
 
     @property
+    def gym_id(self) -> str:
+        """The id under which Gymnasium knows the task with the defaults of its parameters."""
+        return gym_id(self.name)
+
+    @property
     def horizon(self) -> int:
         """Frames of one demonstration."""
         return sum(primitive.frames for primitive in self.primitives)
@@ -68,6 +80,19 @@ class Task:
     def labels(self) -> tuple[str, ...]:
         """Names of the primitives, each once, in the order of their first use: a label is an index into this."""
         return tuple(dict.fromkeys(primitive.name for primitive in self.primitives))
+
+    def episode_limit(self, frames: int | None, option: str) -> int:
+        """Frames after which an episode is cut: ``frames``, or the horizon if it is None.
+
+        Raises:
+            ValueError: the episode would be cut before its success is judged; names ``option``, which set ``frames``.
+        """
+        if frames is not None and frames < self.horizon:
+            raise ValueError(
+                f"{option} must be at least {self.horizon}, got {frames}: "
+                f"the success of {self.name} is judged from frame {self.horizon} on"
+            )
+        return self.horizon if frames is None else frames
 
     def read_measures(self, world: World) -> dict[str, float]:
         """The measures by name."""
