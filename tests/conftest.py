@@ -25,5 +25,5 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = shared / "table_lift_6"
     with FileLock(str(root) + ".lock"):
         if not root.exists():
-            record(Recipe("table_lift"), 6, 0, "hdril/test", root)
+            record(Recipe("table_lift"), 6, 0, root)
     return root

@@ -65,7 +65,7 @@ def bench_recording(task: str, episodes: int, root: Path) -> Figure:
 
     World.step = timed_step  # pyright: ignore
     try:
-        whole = _seconds(lambda: record(Recipe(task), episodes, 0, "hdril/bench", root))
+        whole = _seconds(lambda: record(Recipe(task), episodes, 0, root))
     finally:
         World.step = step
     return Figure("recording, share of the bare simulator's rate", 100.0 * bare / whole, 70.0, True, "%")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from tqdm import tqdm
 
-from hdril.cli.common import run
+from hdril.cli.common import check_repo_id, run
 from hdril.demonstrations.provenance import Recipe, read_provenance
 from hdril.demonstrations.record import record
 from hdril.tasks.primitives import Noise
@@ -23,8 +24,9 @@ class RecordConfig:
     After Ctrl-C, the same command goes on where it was.
     """
 
-    repo_id: str
-    """Name of the dataset, as user/name."""
+    repo_id: str | None = None
+    """Name of the dataset on the Hugging Face Hub, as user/name. Only --push needs it: a dataset that stays here has no name,
+    and --dataset.repo_id of LeRobot's commands may be any beside --dataset.root."""
     task: str = "table_lift"
     """Name of the task, with its parameters if it has any (peg_in_hole:clearance=0.004); an unknown one is answered with
     those there are."""
@@ -33,7 +35,8 @@ class RecordConfig:
     seed: int = 0
     """Seed of the first episode; the following ones count up. Evaluation uses other seeds (100000 and up)."""
     root: Path | None = None
-    """Folder of the dataset; must not exist. Default: LeRobot's home, under repo_id."""
+    """Folder of the dataset; must not exist. Default: LeRobot's home under repo_id if that is given, else
+    outputs/<task>/dataset."""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Processes that simulate. The dataset is the same for any number."""
     noise: Noise = field(default_factory=Noise)
@@ -46,14 +49,31 @@ class RecordConfig:
 
 
 def record_command(config: RecordConfig) -> None:
-    if config.repo_id.count("/") != 1:
-        raise ValueError(f"repo_id must look like user/name, got {config.repo_id!r}")
+    """Record, and publish if asked to."""
+    if config.repo_id is not None:
+        check_repo_id("repo_id", config.repo_id)
+    elif config.push:
+        raise ValueError("--push needs --repo_id: the name of the dataset on the Hub, as user/name")
     recipe = Recipe(config.task, config.noise)
-    root = config.root or _default_root(config.repo_id)
+    root = config.root or default_root(config.task, config.repo_id)
     if config.push and root.exists():
         _check_same(root, recipe, config)
-        _push(config, root)
-        return
+    else:
+        _record(recipe, config, root)
+    if config.push and config.repo_id is not None:
+        _push(config.repo_id, config, root)
+
+
+def default_root(task: str, repo_id: str | None) -> Path:
+    """Where a dataset goes unless the user says where: where LeRobot looks for ``repo_id``, or beside the task's policies."""
+    if repo_id is None:
+        return Path("outputs") / re.sub(r"[^\w.-]+", "_", task) / "dataset"
+    from lerobot.utils.constants import HF_LEROBOT_HOME
+
+    return HF_LEROBOT_HOME / repo_id
+
+
+def _record(recipe: Recipe, config: RecordConfig, root: Path) -> None:
     start = time.monotonic()
     with tqdm(total=max(config.num_episodes, 0), desc=f"recording {config.task}", unit="episode") as bar:
 
@@ -62,31 +82,29 @@ def record_command(config: RecordConfig) -> None:
             bar.update(kept - bar.n)
 
         try:
-            recording = record(recipe, config.num_episodes, config.seed, config.repo_id, root, config.workers, progress)
+            made = record(recipe, config.num_episodes, config.seed, root, config.workers, progress)
         except KeyboardInterrupt:
             bar.close()
             print(f"\nStopped; nothing was written to {root}. Run the same command again to go on.")
             raise
-    tried = len(recording.seeds) + len(recording.dropped)
+    tried = len(made.seeds) + len(made.dropped)
     print(
-        f"{len(recording.seeds)} episodes (seeds {recording.seeds[0]} to {recording.seeds[-1]}) in {recording.root}, "
-        f"{len(recording.dropped)} of {tried} dropped, {time.monotonic() - start:.0f} s"
+        f"{len(made.seeds)} episodes (seeds {made.seeds[0]} to {made.seeds[-1]}) in {root}, "
+        f"{len(made.dropped)} of {tried} dropped, {time.monotonic() - start:.0f} s"
     )
-    for seed, why in recording.dropped.items():
+    for seed, why in made.dropped.items():
         print(f"  dropped seed {seed}: {why}")
-    if config.push:
-        _push(config, root)
 
 
 def _check_same(root: Path, recipe: Recipe, config: RecordConfig) -> None:
     """Raises FileExistsError unless the dataset at ``root`` is what the options ask for."""
     provenance = read_provenance(root)
     asked = (recipe, config.num_episodes, config.seed)
-    if provenance is None or asked != (provenance.recipe, len(provenance.seeds), min(provenance.seeds)):
+    if provenance is None or asked != (provenance.recipe, len(provenance.seeds), provenance.first_seed):
         raise FileExistsError(f"{root} exists and holds something else; choose another root or delete it")
 
 
-def _push(config: RecordConfig, root: Path) -> None:
+def _push(repo_id: str, config: RecordConfig, root: Path) -> None:
     from hdril.hub.cards import dataset_card
     from hdril.hub.publish import publish
 
@@ -95,17 +113,11 @@ def _push(config: RecordConfig, root: Path) -> None:
         for folder in ("data", "meta")
         for path in sorted((root / folder).rglob("*.*"))
     }
-    files["README.md"] = dataset_card(config.repo_id, root).encode()
+    files["README.md"] = dataset_card(repo_id, root).encode()
     # LeRobot finds the version of a dataset's format by this tag.
     tag = json.loads((root / "meta/info.json").read_text())["codebase_version"]
     message = f"{config.num_episodes} episodes of {config.task}"
-    print(f"Published: {publish(config.repo_id, 'dataset', files, message, config.private, tag)}")
-
-
-def _default_root(repo_id: str) -> Path:
-    from lerobot.utils.constants import HF_LEROBOT_HOME
-
-    return HF_LEROBOT_HOME / repo_id
+    print(f"Published: {publish(repo_id, 'dataset', files, message, config.private, tag)}")
 
 
 def main() -> None:

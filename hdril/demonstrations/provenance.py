@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -10,6 +11,7 @@ from typing import Any
 
 from hdril import __version__
 from hdril.env import BimanualEnv
+from hdril.simulation.robots import ROBOTS
 from hdril.simulation.world import Physics
 from hdril.tasks import get_task
 from hdril.tasks.expert import ScriptedExpert
@@ -36,35 +38,72 @@ class Recipe:
 
     def __post_init__(self) -> None:
         task = get_task(self.task)
+        if self.robot not in ROBOTS:
+            raise ValueError(f"unknown robot {self.robot!r}; choose from: {', '.join(ROBOTS)}")
         if self.physics is None:
             object.__setattr__(self, "physics", task.physics)
 
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self) | {"hdril_version": __version__}
+    def as_dict(self, hdril_version: str = __version__) -> dict[str, Any]:
+        """The recipe and the version of hdril that plays it, for JSON."""
+        return asdict(self) | {"hdril_version": hdril_version}
 
     @staticmethod
     def from_dict(values: dict[str, Any]) -> Recipe:
+        """The inverse of :meth:`as_dict`, but for the version."""
         return Recipe(values["task"], Noise(**values["noise"]), Physics(**values["physics"]), values["robot"])
 
     def make_env(self) -> BimanualEnv:
+        """The environment in which the expert demonstrates."""
         return BimanualEnv(self.task, robot=self.robot, physics=self.physics)
 
     def make_expert(self) -> ScriptedExpert:
+        """The expert that demonstrates."""
         return ScriptedExpert(get_task(self.task), self.noise)
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """How a dataset was made: its recipe and the seeds of its episodes, in order."""
+    """How a dataset was made: its recipe, the seeds of its episodes in order, and why which seeds were dropped."""
 
     recipe: Recipe
     seeds: tuple[int, ...]
+    dropped: dict[int, str] = field(default_factory=dict)
+    hdril_version: str = __version__
+
+    @property
+    def first_seed(self) -> int:
+        """The seed that was tried first."""
+        return min((*self.seeds, *self.dropped))
+
+    @property
+    def recipe_digest(self) -> str:
+        """SHA-256, in hexadecimal, of the key ``recipe`` of ``meta/hdril.json``, as canonical JSON (sorted keys, no spaces).
+
+        Datasets with the same digest hold the same episode for the same seed.
+        """
+        text = json.dumps(self.recipe.as_dict(self.hdril_version), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def write_provenance(root: Path, provenance: Provenance) -> None:
+    """Write ``meta/hdril.json``."""
+    values = {
+        "recipe": provenance.recipe.as_dict(provenance.hdril_version),
+        "seeds": list(provenance.seeds),
+        "dropped": {str(seed): why for seed, why in provenance.dropped.items()},
+    }
+    (root / RECIPE_PATH).write_text(json.dumps(values, indent=2))
 
 
 def read_provenance(root: Path) -> Provenance | None:
-    """The recipe and seeds of a dataset; None for a dataset that hdril did not record."""
-    path = root / RECIPE_PATH
+    """How a dataset was made; None for a dataset that hdril did not record."""
     with suppress(FileNotFoundError):
-        values = json.loads(path.read_text())
-        return Provenance(Recipe.from_dict(values["recipe"]), tuple(values["seeds"]))
+        values = json.loads((root / RECIPE_PATH).read_text())
+        recipe, dropped = values["recipe"], values["dropped"]
+        return Provenance(
+            Recipe.from_dict(recipe),
+            tuple(values["seeds"]),
+            {int(seed): why for seed, why in dropped.items()},
+            recipe["hdril_version"],
+        )
     return None

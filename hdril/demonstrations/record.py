@@ -3,76 +3,91 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Generator
+from collections import deque
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
-from dataclasses import dataclass
+from functools import cache
+from itertools import islice
 from multiprocessing import get_context
 from pathlib import Path
 
 from hdril.demonstrations.episode import Episode, demonstrate
-from hdril.demonstrations.provenance import Recipe
-from hdril.demonstrations.schema import write_dataset
-from hdril.demonstrations.shards import Shelf
+from hdril.demonstrations.provenance import Provenance, Recipe
+from hdril.demonstrations.shards import Shards
+from hdril.demonstrations.write import write_dataset
 from hdril.env import BimanualEnv
-from hdril.files import MAX_SEED
+from hdril.errors import UserError
+from hdril.files import MAX_SEED, exclusively
 from hdril.tasks.expert import ScriptedExpert
 
-_worker: tuple[BimanualEnv, ScriptedExpert] | None = None
+PATIENCE = 20
+"""How many more demonstrations may fail than succeed before a recording is given up."""
 
 
-def _start_worker(recipe: Recipe) -> None:
-    global _worker
-    _worker = recipe.make_env(), recipe.make_expert()
+class ExpertError(UserError):
+    """The expert fails more often than it succeeds: the task, its parameters or the noise cannot be right."""
 
 
-def _work(seed: int) -> Episode:
-    if _worker is None:
-        raise RuntimeError("the worker was not started")
-    return demonstrate(*_worker, seed)
+@cache
+def _stage(recipe: Recipe) -> tuple[BimanualEnv, ScriptedExpert]:
+    """What a worker process needs, made for its first episode."""
+    return recipe.make_env(), recipe.make_expert()
+
+
+def _work(recipe: Recipe, seed: int) -> Episode:
+    return demonstrate(*_stage(recipe), seed)
 
 
 def episodes(recipe: Recipe, first_seed: int, workers: int = 1) -> Generator[Episode]:
-    """Demonstrations of seeds ``first_seed``, + 1, + 2, …, in this order whatever the number of workers, without end.
+    """Demonstrations of seeds ``first_seed``, + 1, + 2, … up to :data:`~hdril.files.MAX_SEED`, in this order whatever the
+    number of workers.
 
     Close the iterator when you have enough.
+
+    Raises:
+        UserError: a worker process died.
     """
-    if workers == 1:
-        env, expert = recipe.make_env(), recipe.make_expert()
-        with closing(env):
-            for seed in range(first_seed, MAX_SEED):
-                yield demonstrate(env, expert, seed)
+    seeds = iter(range(first_seed, MAX_SEED + 1))
+    if workers > 1:
+        yield from _in_parallel(recipe, seeds, workers)
         return
-    pool = ProcessPoolExecutor(workers, get_context("forkserver"), initializer=_start_worker, initargs=(recipe,))
-    pending: list[Future[Episode]] = []
-    seeds = iter(range(first_seed, MAX_SEED))
+    env, expert = recipe.make_env(), recipe.make_expert()
+    with closing(env):
+        for seed in seeds:
+            yield demonstrate(env, expert, seed)
+
+
+def _in_parallel(recipe: Recipe, seeds: Iterator[int], workers: int) -> Generator[Episode]:
+    # Workers that are forked from this process would inherit its threads' locks.
+    pool = ProcessPoolExecutor(workers, get_context("forkserver"))
+    pending: deque[Future[Episode]] = deque()
+
+    def submit(count: int) -> None:
+        pending.extend(pool.submit(_work, recipe, seed) for seed in islice(seeds, count))
+
     try:
-        pending = [pool.submit(_work, next(seeds)) for _ in range(2 * workers)]
-        while True:
-            yield pending.pop(0).result()
-            pending.append(pool.submit(_work, next(seeds)))
+        submit(2 * workers)
+        while pending:
+            yield pending.popleft().result()
+            submit(1)
+    except BrokenProcessPool as error:
+        raise UserError(
+            f"a worker process was killed; {workers} workers may need more memory than there is: try fewer"
+        ) from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-@dataclass(frozen=True)
-class Recording:
-    """What was recorded: where, the seeds of the episodes in order, and why which seeds were dropped."""
-
-    root: Path
-    seeds: tuple[int, ...]
-    dropped: dict[int, str]
 
 
 def record(
     recipe: Recipe,
     num_episodes: int,
     first_seed: int,
-    repo_id: str,
     root: Path,
     workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
-) -> Recording:
+) -> Provenance:
     """Record ``num_episodes`` successful demonstrations as a LeRobot dataset at ``root``.
 
     Seeds are tried in order from ``first_seed``; failures are dropped and reported. Until the dataset is whole it lives
@@ -81,8 +96,9 @@ def record(
 
     Raises:
         FileExistsError: there is something at ``root``.
-        ValueError: a number out of range, or a partial recording of another recipe.
-        RuntimeError: the expert fails more often than it succeeds: the scene cannot be right.
+        ValueError: a number out of range, a partial recording of another recipe, or too few seeds up to the largest.
+        ExpertError: the expert fails more often than it succeeds.
+        BusyError: another process records to ``root``.
     """
     if num_episodes < 1:
         raise ValueError(f"num_episodes must be at least 1, got {num_episodes}")
@@ -90,42 +106,74 @@ def record(
         raise ValueError(f"seed must be from 0 to {MAX_SEED - num_episodes}, got {first_seed}")
     if workers < 1:
         raise ValueError(f"workers must be at least 1, got {workers}")
+    _refuse_existing(root)
+    partial = root.with_name(root.name + ".partial")
+    with exclusively(partial, f"recording to {root}"):
+        try:
+            _refuse_existing(root)  # the process that held the lock until now may have finished it
+            shards = Shards(partial, recipe, first_seed)
+            selection = _Selection(num_episodes, progress)
+            _fill(selection, shards, lambda seed: episodes(recipe, seed, workers), first_seed)
+            provenance = Provenance(recipe, tuple(episode.seed for episode in selection.kept), selection.dropped)
+            _publish(provenance, selection.kept, partial, root)
+        except BaseException as error:
+            if isinstance(error, ExpertError) or not any(partial.glob("*.npz")):
+                shutil.rmtree(partial)  # there is nothing to go on from
+            raise
+    return provenance
+
+
+def _refuse_existing(root: Path) -> None:
     if root.exists():
         raise FileExistsError(f"{root} exists; choose another root or delete it")
-    partial = root.with_name(root.name + ".partial")
-    shelf = Shelf(partial, recipe, first_seed)
-    kept: list[Episode] = []
-    dropped: dict[int, str] = {}
 
-    def keep_or_drop(episode: Episode) -> None:
+
+class _Selection:
+    """Keeps successful episodes until there are ``wanted``, and drops the others."""
+
+    def __init__(self, wanted: int, progress: Callable[[int, int], None] | None) -> None:
+        self.kept: list[Episode] = []
+        self.dropped: dict[int, str] = {}
+        self._wanted, self._progress = wanted, progress
+
+    @property
+    def complete(self) -> bool:
+        return len(self.kept) == self._wanted
+
+    def add(self, episode: Episode) -> None:
         if episode.success:
-            kept.append(episode)
+            self.kept.append(episode)
         else:
-            dropped[episode.seed] = episode.unmet
-            if len(dropped) > 20 + len(kept):
-                raise RuntimeError(
-                    f"the expert failed on {len(dropped)} of {len(dropped) + len(kept)} seeds; last: {episode.unmet}"
-                )
-        if progress:
-            progress(len(kept), len(dropped))
+            self.dropped[episode.seed] = episode.unmet
+        if len(self.dropped) > PATIENCE + len(self.kept):
+            tried = len(self.dropped) + len(self.kept)
+            raise ExpertError(f"the expert failed on {len(self.dropped)} of {tried} seeds; last: {episode.unmet}")
+        if self._progress:
+            self._progress(len(self.kept), len(self.dropped))
 
+
+def _fill(selection: _Selection, shards: Shards, stream: Callable[[int], Generator[Episode]], first_seed: int) -> None:
+    """Add the episodes of an earlier, interrupted recording, and then new ones."""
     seed = first_seed
-    for episode in shelf.take(first_seed):
-        if len(kept) == num_episodes:
-            break
-        keep_or_drop(episode)
+    for episode in shards.take():
+        selection.add(episode)
+        if selection.complete:
+            return
         seed = episode.seed + 1
-    if len(kept) < num_episodes:
-        with closing(episodes(recipe, seed, workers)) as stream:
-            for episode in stream:
-                shelf.put(episode)
-                keep_or_drop(episode)
-                if len(kept) == num_episodes:
-                    break
+    with closing(stream(seed)) as fresh:
+        for episode in fresh:
+            shards.put(episode)
+            selection.add(episode)
+            if selection.complete:
+                return
+    raise ValueError(f"only {len(selection.kept)} demonstrations succeeded up to the largest seed; choose a lower seed")
+
+
+def _publish(provenance: Provenance, kept: list[Episode], partial: Path, root: Path) -> None:
+    """Write the dataset beside its place and move it there when it is whole."""
     staged = partial / "dataset"
     shutil.rmtree(staged, ignore_errors=True)
-    write_dataset(staged, repo_id, recipe, kept, dropped)
+    write_dataset(staged, provenance, kept)
     root.parent.mkdir(parents=True, exist_ok=True)
     staged.replace(root)
     shutil.rmtree(partial, ignore_errors=True)
-    return Recording(root, tuple(episode.seed for episode in kept), dropped)

@@ -3,40 +3,60 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from collections.abc import Iterator
+from dataclasses import fields
+from itertools import count
 from pathlib import Path
 
 import numpy as np
 
 from hdril.demonstrations.episode import Episode
 from hdril.demonstrations.provenance import Recipe
-from hdril.files import MAX_SEED
+from hdril.files import write_atomically
 
 
-class Shelf:
-    """Episodes of an unfinished recording, a file each, so that an interrupted one can go on where it was."""
+class Shards:
+    """Episodes of an unfinished recording, a file each, so that an interrupted one can go on where it was.
+
+    Raises:
+        ValueError: the folder holds episodes of another recipe or first seed.
+    """
 
     def __init__(self, folder: Path, recipe: Recipe, first_seed: int) -> None:
-        self.folder = folder
-        plan = recipe.as_dict() | {"first_seed": first_seed}
+        self._folder, self._first_seed = folder, first_seed
+        plan = json.dumps(recipe.as_dict() | {"first_seed": first_seed}, indent=2)
         plan_file = folder / "plan.json"
-        if plan_file.exists() and json.loads(plan_file.read_text()) != plan:
+        if plan_file.exists() and plan_file.read_text() != plan:
             raise ValueError(f"{folder} holds episodes of another recipe; delete it or choose another root")
-        folder.mkdir(parents=True, exist_ok=True)
-        plan_file.write_text(json.dumps(plan, indent=2))
+        write_atomically(plan_file, lambda file: file.write(plan.encode()))
+
+    def path(self, seed: int) -> Path:
+        """Where the episode of a seed is kept."""
+        return self._folder / f"{seed}.npz"
 
     def put(self, episode: Episode) -> None:
-        part = self.folder / "part.tmp"
-        with part.open("wb") as file:
-            np.savez(file, allow_pickle=False, **{name: np.asarray(value) for name, value in vars(episode).items()})
-        part.replace(self.folder / f"{episode.seed}.npz")
+        """Keep an episode, whether it succeeded or not."""
+        arrays = {name: np.asarray(value) for name, value in vars(episode).items()}
+        write_atomically(self.path(episode.seed), lambda file: np.savez(file, allow_pickle=False, **arrays))
 
-    def take(self, first_seed: int) -> Iterator[Episode]:
-        """Episodes from ``first_seed`` on, up to the first that is not there."""
-        for seed in range(first_seed, MAX_SEED):
-            path = self.folder / f"{seed}.npz"
-            if not path.exists():
+    def take(self) -> Iterator[Episode]:
+        """Episodes from the first seed on, up to the first that is not there or cannot be read; that one is to be made again."""
+        for seed in count(self._first_seed):
+            if not self.path(seed).exists():
                 return
-            with np.load(path) as data:
-                values = dict(data)
-            yield Episode(**values | {"seed": seed, "success": bool(values["success"]), "unmet": str(values["unmet"])})
+            try:
+                yield _load(self.path(seed), seed)
+            except (ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+                print(f"{self.path(seed)} cannot be read ({error}); the episode is made again", flush=True)
+                return
+
+
+def _load(path: Path, seed: int) -> Episode:
+    with np.load(path, allow_pickle=False) as data:
+        values = {field.name: data[field.name] for field in fields(Episode)}
+    if values["seed"] != seed:
+        raise ValueError(f"it holds seed {values['seed']}")
+    if len({len(value) for value in values.values() if value.ndim}) != 1:
+        raise ValueError("its arrays differ in length")
+    return Episode(**values | {"seed": seed, "success": bool(values["success"]), "unmet": str(values["unmet"])})

@@ -15,6 +15,7 @@ import rerun.blueprint as rrb
 
 from hdril.actor import ReplayActor
 from hdril.demonstrations.provenance import Provenance, read_provenance
+from hdril.demonstrations.read import StoredEpisode, read_episode
 from hdril.env import BimanualEnv
 from hdril.evaluation.evaluate import EvaluatedEpisode, Job, Worker
 from hdril.evaluation.reference import ReferenceCache
@@ -102,64 +103,44 @@ def show_dataset(root: Path, episode: int, path: Path) -> tuple[Path, str]:
         FileNotFoundError: there is no dataset.
         ValueError: it has no such episode.
     """
-    if not (root / "meta/info.json").exists():
-        raise FileNotFoundError(f"{root} is no LeRobot dataset: it has no meta/info.json")
-    import pandas as pd
-
-    frames = pd.read_parquet(root / "data", filters=[("episode_index", "==", episode)]).sort_values("frame_index")
-    if frames.empty:
-        count = json.loads((root / "meta/info.json").read_text())["total_episodes"]
-        raise ValueError(f"{root} has no episode {episode}; its episodes are 0 to {count - 1}")
+    stored = read_episode(root, episode)
     provenance = read_provenance(root)
     if provenance is None:
-        return _foreign(root, frames, path), "not recorded by hdril: poses, numbers and labels only"
-    return _own(provenance, episode, frames, path)
+        return _foreign(stored, path), "not recorded by hdril: poses, numbers and labels only"
+    return _own(provenance, episode, stored, path)
 
 
-def _own(provenance: Provenance, episode: int, frames: Any, path: Path) -> tuple[Path, str]:
+def _own(provenance: Provenance, episode: int, stored: StoredEpisode, path: Path) -> tuple[Path, str]:
     seed = provenance.seeds[episode]
-    actions = ReplayActor(np.stack(frames["action"].to_numpy()))
-    labels = frames["subtask_index"].to_numpy()
+    actions = ReplayActor(stored.action)
     env = provenance.recipe.make_env()
     with closing(env):
         reference = ReferenceCache(BimanualEnv(provenance.recipe.task)).get(seed)
-        trace, ending = trace_episode(env, actions, seed, labels)
+        trace, ending = trace_episode(env, actions, seed, stored.label)
         outcome = score_episode(env.task_spec, seed, trace, reference, ending)
         name = f"episode_{episode:06d}_{recording_name(outcome)}"
         write_episodes(path, name, {"": EvaluatedEpisode(env, outcome, trace, reference)})
-    apart = np.abs(trace.state[:-1] - np.stack(frames["observation.state"].to_numpy())).max()
+    apart = np.abs(trace.state[:-1] - stored.state).max()
     return path, f"seed {seed}, played again: its states are {apart:.2g} m or less from the recorded ones"
 
 
-def _foreign(root: Path, frames: Any, path: Path) -> Path:
-    from lerobot_policy_hdril.demonstrations import read_primitives
-    from lerobot_policy_hdril.graph import feature_names, pose_groups
-
-    features = json.loads((root / "meta/info.json").read_text())["features"]
-    times = frames["timestamp"].to_numpy(dtype=float)
-    at = [rr.TimeColumn(TIMELINE, duration=times)]
+def _foreign(stored: StoredEpisode, path: Path) -> Path:
+    at = [rr.TimeColumn(TIMELINE, duration=stored.time)]
     path.parent.mkdir(parents=True, exist_ok=True)
     views: list[Any] = [rrb.Spatial3DView(origin="world", name="Poses")]
     with rr.RecordingStream(APPLICATION) as stream:
         stream.save(path)
-        for key, feature in features.items():
-            if key != "action" and not key.startswith("observation."):
-                continue
-            if feature["dtype"] not in ("float32", "float64") or len(feature["shape"]) != 1:
-                continue
-            values = np.stack(frames[key].to_numpy())
-            names = feature_names(key, feature)
-            for column, name in enumerate(names):
-                stream.send_columns(f"{key}/{name}", at, rr.Scalars.columns(scalars=values[:, column].astype(float)))
-            for group in pose_groups(names):
-                positions = values[:, group[:3]]
-                entity = f"world/{key}/{names[group[0]].rsplit('.', 1)[0]}"
-                stream.send_columns(entity, at, rr.Points3D.columns(positions=positions).partition([1] * len(times)))
+        for key, signal in stored.signals.items():
+            for name, values in zip(signal.names, signal.values.T, strict=True):
+                stream.send_columns(f"{key}/{name}", at, rr.Scalars.columns(scalars=values))
+            for name, positions in signal.positions().items():
+                entity = f"world/{key}/{name}"
+                columns = rr.Points3D.columns(positions=positions).partition([1] * len(positions))
+                stream.send_columns(entity, at, columns)
                 stream.log(f"{entity}_path", rr.LineStrips3D([positions]), static=True)
             views.append(rrb.TimeSeriesView(origin=key, name=key))
-        if "subtask_index" in frames:
-            labels = frames["subtask_index"].to_numpy()
-            log_lane(stream, "primitive/scripted", labels, tuple(read_primitives(root)), times)
+        if stored.label is not None:
+            log_lane(stream, "primitive/scripted", stored.label, stored.primitives, stored.time)
             views.insert(1, rrb.StateTimelineView(origin="primitive", name="Primitives"))
         stream.send_blueprint(rrb.Blueprint(rrb.Vertical(*views), collapse_panels=True))
     return path

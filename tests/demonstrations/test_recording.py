@@ -14,9 +14,9 @@ from lerobot.datasets import LeRobotDataset
 
 import hdril.demonstrations.record as recording
 from hdril.demonstrations.episode import Episode, demonstrate
-from hdril.demonstrations.provenance import Recipe, read_provenance
-from hdril.demonstrations.record import episodes, record
-from hdril.demonstrations.schema import write_dataset
+from hdril.demonstrations.provenance import Provenance, Recipe, read_provenance
+from hdril.demonstrations.record import ExpertError, episodes, record
+from hdril.demonstrations.write import write_dataset
 from hdril.simulation.actions import ACTION_NAMES
 from hdril.tasks import TASKS
 from hdril.tasks.expert import ScriptedExpert
@@ -88,7 +88,7 @@ def test_an_episode_can_be_made_again_bit_for_bit(dataset: Path) -> None:
 
 
 def test_same_dataset_for_any_number_of_workers(dataset: Path, tmp_path: Path) -> None:
-    record(Recipe("table_lift"), 3, 0, "hdril/test", tmp_path / "parallel", workers=2)
+    record(Recipe("table_lift"), 3, 0, tmp_path / "parallel", workers=2)
     ours = pd.read_parquet(tmp_path / "parallel/data")
     theirs = pd.read_parquet(dataset / "data").query("episode_index < 3")
     for column in ours:
@@ -117,7 +117,7 @@ def scripted(sample: list[Episode], failing: set[int]):
 
 def test_failures_are_dropped_and_reported(sample, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(recording, "episodes", scripted(sample, {11, 13}))
-    result = record(Recipe("table_lift"), 4, 10, "hdril/test", tmp_path / "set")
+    result = record(Recipe("table_lift"), 4, 10, tmp_path / "set")
     assert result.seeds == (10, 12, 14, 15)
     assert result.dropped == {11: "table upright", 13: "table upright"}
     provenance = json.loads((tmp_path / "set/meta/hdril.json").read_text())
@@ -127,8 +127,8 @@ def test_failures_are_dropped_and_reported(sample, tmp_path, monkeypatch) -> Non
 
 def test_a_hopeless_expert_stops_the_recording(sample, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(recording, "episodes", scripted(sample, set(range(1000))))
-    with pytest.raises(RuntimeError, match="the expert failed on 21 of 21 seeds"):
-        record(Recipe("table_lift"), 4, 0, "hdril/test", tmp_path / "set")
+    with pytest.raises(ExpertError, match="the expert failed on 21 of 21 seeds"):
+        record(Recipe("table_lift"), 4, 0, tmp_path / "set")
     assert not (tmp_path / "set").exists()
 
 
@@ -145,7 +145,7 @@ def test_an_interrupted_recording_goes_on(sample, tmp_path, monkeypatch) -> None
     monkeypatch.setattr(recording, "episodes", interrupted)
     root = tmp_path / "set"
     with pytest.raises(KeyboardInterrupt):
-        record(Recipe("table_lift"), 4, 0, "hdril/test", root)
+        record(Recipe("table_lift"), 4, 0, root)
     assert not root.exists()
     asked = []
 
@@ -155,8 +155,8 @@ def test_an_interrupted_recording_goes_on(sample, tmp_path, monkeypatch) -> None
 
     monkeypatch.setattr(recording, "episodes", rest)
     with pytest.raises(ValueError, match="another recipe"):
-        record(Recipe("table_lift", Noise(0.0)), 4, 0, "hdril/test", root)
-    result = record(Recipe("table_lift"), 4, 0, "hdril/test", root)
+        record(Recipe("table_lift", Noise(0.0)), 4, 0, root)
+    result = record(Recipe("table_lift"), 4, 0, root)
     assert asked == [3]
     assert result.seeds == (0, 1, 3, 4)
     assert result.dropped == {2: "table upright"}
@@ -169,10 +169,10 @@ def test_refusals(tmp_path: Path) -> None:
     recipe = Recipe("table_lift")
     (tmp_path / "there").mkdir()
     with pytest.raises(FileExistsError, match="there exists"):
-        record(recipe, 1, 0, "hdril/test", tmp_path / "there")
+        record(recipe, 1, 0, tmp_path / "there")
     for bad in ({"num_episodes": 0}, {"first_seed": -1}, {"workers": 0}):
         with pytest.raises(ValueError, match="got"):
-            record(recipe, **{"num_episodes": 1, "first_seed": 0, "repo_id": "a/b", "root": tmp_path / "x"} | bad)
+            record(recipe, **{"num_episodes": 1, "first_seed": 0, "root": tmp_path / "x"} | bad)
     with pytest.raises(ValueError, match=r"noise\.waypoint"):
         Noise(0.5)
     assert list(tmp_path.iterdir()) == [tmp_path / "there"]
@@ -194,7 +194,7 @@ def test_rerun_shows_the_primitives_as_text(dataset: Path, tmp_path: Path) -> No
 
 
 def test_written_frames_are_what_was_recorded(sample: list[Episode], tmp_path: Path) -> None:
-    write_dataset(tmp_path / "set", "hdril/test", Recipe("table_lift"), sample, {})
+    write_dataset(tmp_path / "set", Provenance(Recipe("table_lift"), (0, 1)), sample)
     data = LeRobotDataset("hdril/test", root=tmp_path / "set")
     np.testing.assert_array_equal(data[75]["action"].numpy(), sample[1].action[5])
     assert int(data[75]["subtask_index"]) == sample[1].label[5]
