@@ -15,22 +15,30 @@ from hdril.tasks import Task
 from hdril.trace import Trace
 
 DEPARTURE = 0.02
-"""m from the expert's path at which an episode counts as having left it: none of 100 successes of `make demo` did."""
+"""m from the expert at which an episode counts as having left its path. No successful episode of `make demo` goes so far."""
+MIN_PROBABILITY_SUM = 0.999
+"""Least sum of the planner's probabilities over the task's primitives at which the planner is scored."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How one episode went. Errors are against the noise-free expert on the same seed: cm, rad, cm."""
+    """How one episode went. Errors are against the noise-free expert on the same seed."""
 
     seed: int
     success: bool
     unmet: str
+    """The conditions of success that do not hold at the end, separated by commas; empty after a success."""
     frames: int
     ik_failures: int
+    """Frames at which inverse kinematics found no solution for a command."""
     position_error_cm: float
+    """Distance of the hands from the expert's, cm, mean over frames and hands."""
     angle_error_rad: float
+    """Angle between the hands' orientations and the expert's, rad, mean over frames and hands."""
     dtw_cm: float
+    """Mean distance along the optimal warping path, cm, mean of both hands (:func:`hdril.evaluation.metrics.dtw_distance`)."""
     position_error_cm_by_primitive: dict[str, float]
+    """The position error over the frames of each primitive of the expert, cm."""
     start: tuple[float, ...]
     """x and y of every observed object at the start, m."""
     primitives: tuple[str, ...] = ()
@@ -40,7 +48,8 @@ class Outcome:
     measures: dict[str, float] = field(default_factory=dict)
     """The task's measures at the end."""
     planner_confusion: list[list[int]] = field(default_factory=list)
-    """Frames of the expert's primitive (row) at which the planner preferred each (column); empty without a planner."""
+    """Frames of the expert's primitive (row) at which the planner preferred each (column); empty without a planner whose
+    primitives are the task's."""
     planner_boundary_hits: list[bool] = field(default_factory=list)
     """For each primitive of the expert, whether the planner preferred it at its first frame."""
     departed_frame: int = -1
@@ -49,28 +58,13 @@ class Outcome:
     """The primitive that was played then (the expert's, if the policy has none)."""
     expert_success: bool = True
     """Whether the expert solves the scene of this seed. If not, the errors above say nothing about the policy."""
-    expert_success: bool = True
-    """Whether the expert succeeds on this seed. Where it does not, the errors compare with a failed episode."""
 
 
 def score_episode(task: Task, seed: int, trace: Trace, reference: Reference, ending: Ending) -> Outcome:
-    """Compare an episode with the expert's."""
+    """Compare an episode with the expert's on the same seed."""
     error = trajectory_error(trace.state, reference.state)
-    names = np.array(task.labels)
-    # Row i + 1 is where the action of frame i led.
-    labels = reference.scripted[: len(error.position) - 1]
-    by_primitive = {
-        str(name): 100.0 * float(error.position[1:][labels == k].mean())
-        for k, name in enumerate(names)
-        if (labels == k).any()
-    }
-    executed = trace.executed
-    changes = np.flatnonzero(np.diff(executed, prepend=-2))
-    played = tuple(str(names[executed[i]]) for i in changes if 0 <= executed[i] < len(names))
-    start = trace.environment_state[0].reshape(-1, 7)[:, :2]
-    confusion, hits = _planner_scores(trace, len(names))
+    confusion, hits = _planner_scores(trace, len(task.labels))
     departed = _departure(trace, reference)
-    doing = -1 if departed < 0 else executed[departed] if executed[departed] >= 0 else trace.scripted[departed]
     return Outcome(
         seed=seed,
         success=ending.success,
@@ -80,39 +74,78 @@ def score_episode(task: Task, seed: int, trace: Trace, reference: Reference, end
         position_error_cm=100.0 * float(error.position.mean()),
         angle_error_rad=float(error.angle.mean()),
         dtw_cm=100.0 * error.dtw,
-        position_error_cm_by_primitive=by_primitive,
-        start=tuple(round(float(v), 4) for v in start.ravel()),
-        primitives=played,
+        position_error_cm_by_primitive=_error_by_primitive(error.position, reference.scripted, task.labels),
+        start=_start(trace),
+        primitives=_played(trace.executed, task.labels),
         stage=("", *(stage.name for stage in task.stages), "success")[trace.stage[-1]],
         planner_confusion=confusion,
         planner_boundary_hits=hits,
         departed_frame=departed,
-        departed_in=str(names[doing]) if doing >= 0 else "",
+        departed_in=_primitive_at(trace, departed, task.labels),
         measures={m.name: round(float(v), 5) for m, v in zip(task.measures, trace.measures[-1], strict=True)},
         expert_success=reference.success,
     )
 
 
+def _error_by_primitive(
+    position: NDArray[np.float64], scripted: NDArray[np.int64], labels: tuple[str, ...]
+) -> dict[str, float]:
+    """Mean of the position error (T + 1,), m, over the frames of each primitive, in cm."""
+    after = position[1:]  # row i + 1 is where the action of frame i led
+    scripted = scripted[: len(after)]
+    return {
+        name: 100.0 * float(after[scripted == label].mean())
+        for label, name in enumerate(labels)
+        if (scripted == label).any()
+    }
+
+
+def _start(trace: Trace) -> tuple[float, ...]:
+    """x and y of every observed object before the first frame, m, to a tenth of a millimetre."""
+    positions = trace.environment_state[0].reshape(-1, 7)[:, :2]
+    return tuple(round(float(value), 4) for value in positions.ravel())
+
+
+def _played(executed: NDArray[np.int64], labels: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of the executed primitives in order, each run of frames once."""
+    first = np.flatnonzero(np.diff(executed, prepend=-1))
+    return tuple(labels[executed[frame]] for frame in first if executed[frame] >= 0)
+
+
+def _primitive_at(trace: Trace, frame: int, labels: tuple[str, ...]) -> str:
+    """The primitive that was played at a frame, or the expert's if the policy has none; empty for frame -1."""
+    if frame < 0:
+        return ""
+    label = trace.executed[frame] if trace.executed[frame] >= 0 else trace.scripted[frame]
+    return labels[label] if label >= 0 else ""
+
+
 def _departure(trace: Trace, reference: Reference) -> int:
     """The frame whose end is the first with a hand or an object too far from the expert's; -1 if there is none."""
-
-    def positions(episode: Trace | Reference) -> NDArray[np.float64]:
-        objects = episode.environment_state.reshape(len(episode.state), -1, 7).astype(np.float64)
-        return np.concatenate([hand_poses(episode.state), objects], axis=1)[..., :3]
-
-    ours, theirs = positions(trace), positions(reference)
+    ours, theirs = _positions(trace), _positions(reference)
     frames = min(len(ours), len(theirs))
     away = np.linalg.norm(ours[:frames] - theirs[:frames], axis=-1).max(1) > DEPARTURE
     return max(int(away.argmax()) - 1, 0) if away.any() else -1
 
 
+def _positions(episode: Trace | Reference) -> NDArray[np.float64]:
+    """Positions (T + 1, hands and objects, 3), m."""
+    objects = episode.environment_state.reshape(len(episode.state), -1, 7).astype(np.float64)
+    return np.concatenate([hand_poses(episode.state), objects], axis=1)[..., :3]
+
+
 def _planner_scores(trace: Trace, count: int) -> tuple[list[list[int]], list[bool]]:
-    """Confusion matrix (K, K) over frames, and hits at the first frames of the expert's primitives."""
-    if any(explanation is None for explanation in trace.explanations):
+    """Confusion matrix (K, K) over frames, and hits at the first frames of the expert's primitives.
+
+    Both are empty unless every frame has the planner's probabilities of all K primitives. If they do not sum to 1, the
+    planner has other primitives as well, and the most probable one of the task need not be its choice.
+    """
+    explanations = [explanation for explanation in trace.explanations if explanation is not None]
+    sums = np.array([explanation.probabilities.sum() for explanation in explanations])
+    if len(explanations) < len(trace.explanations) or (sums < MIN_PROBABILITY_SUM).any():
         return [], []
-    preferred = trace.predicted
     confusion = np.zeros((count, count), np.int64)
-    scripted = trace.scripted
-    np.add.at(confusion, (scripted[scripted >= 0], preferred[scripted >= 0]), 1)
-    first = np.flatnonzero(np.diff(scripted, prepend=-1))
-    return confusion.tolist(), [bool(preferred[i] == scripted[i]) for i in first if scripted[i] >= 0]
+    labelled = trace.scripted >= 0
+    np.add.at(confusion, (trace.scripted[labelled], trace.predicted[labelled]), 1)
+    first = np.flatnonzero((np.diff(trace.scripted, prepend=-1) != 0) & labelled)
+    return confusion.tolist(), (trace.predicted[first] == trace.scripted[first]).tolist()

@@ -1,4 +1,4 @@
-"""Metrics, intervals, held-out seeds, traces, recordings and reports."""
+"""Traces, recordings, and held-out seeds."""
 
 from __future__ import annotations
 
@@ -14,17 +14,12 @@ from hdril.env import BimanualEnv
 from hdril.evaluation.evaluate import EvaluatedEpisode
 from hdril.evaluation.held_out import check_held_out, training_provenance
 from hdril.evaluation.reference import Reference, ReferenceCache
-from hdril.evaluation.report import Run, headline, write_report
 from hdril.evaluation.score import Outcome, score_episode
-from hdril.evaluation.statistics import wilson_interval
-from hdril.rollout import Ending
 from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.primitives import Noise
 from hdril.trace import Trace, trace_episode
 from hdril.viewer.recordings import recording_name, write_recording
 from tests.evaluation.rerun_text import read_back, states
-
-SUCCEEDED = Ending(True, "", 70)
 
 
 @pytest.fixture(scope="module")
@@ -100,41 +95,6 @@ def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path:
     assert "failure: table at rest" in text
     assert not states(text, "/primitive/executed") & {"lift"}
     assert states(text, "/primitive/scripted") == set(env.task_spec.labels)
-
-
-def test_planner_is_scored_by_frames_and_at_boundaries(played) -> None:
-    """A planner that takes the first frame of lift for move is wrong at one frame of 70 and one boundary of six."""
-    env, trace, _ = played
-    move, lift = (env.task_spec.labels.index(name) for name in ("move", "lift"))
-    first = int(np.flatnonzero(trace.scripted == lift)[0])
-    explanations = list(trace.explanations)
-    explanations[first] = replace(explanations[first], probabilities=np.eye(6)[move])
-    outcome = score_episode(
-        env.task_spec, 0, replace(trace, explanations=tuple(explanations)), Reference.of(trace, SUCCEEDED), SUCCEEDED
-    )
-    assert outcome.planner_confusion[lift][move] == 1
-    assert np.trace(outcome.planner_confusion) == 69
-    assert outcome.planner_boundary_hits == [True, True, False, True, True, True]
-    nobody = replace(trace, explanations=(None,) * len(trace.explanations))
-    assert score_episode(env.task_spec, 0, nobody, Reference.of(trace, SUCCEEDED), SUCCEEDED).planner_confusion == []
-
-
-def test_report_says_what_happened(played, tmp_path: Path) -> None:
-    _, _, outcome = played
-    outcomes = [replace(outcome, seed=s, success=s != 5, unmet="" if s != 5 else "table upright") for s in range(10)]
-    run = Run("table_lift", "somewhere", (), 0, 10, True)
-    write_report(tmp_path, run, outcomes)
-    data = json.loads((tmp_path / "results.json").read_text())
-    assert (data["n_success"], data["n_episodes"], data["pc_success"]) == (9, 10, 90.0)
-    assert data["pc_success_ci95"] == pytest.approx([100 * v for v in wilson_interval(9, 10)])
-    assert data["pc_expert_order"] == 100.0
-    assert data["planner"]["pc_correct"] == data["planner"]["pc_correct_at_boundaries"] == 100.0
-    assert np.array(data["planner"]["confusion"]).sum() == 700
-    assert "9 of 10 succeeded: 90.0 %" in headline(data)
-    text = (tmp_path / "report.md").read_text()
-    assert "table upright (1)" in text
-    assert "| 5 | table upright |" in text
-    assert (tmp_path / "report.png").stat().st_size > 10_000
 
 
 def test_seeds_of_the_training_data_are_refused(dataset: Path, tmp_path: Path) -> None:
