@@ -1,7 +1,7 @@
 """Movement primitives: labelled pieces of a demonstration, each a short list of waypoints for both hands.
 
-A primitive is planned from what is observed at its first frame, so a chain of them follows the objects wherever they
-really are. Constructors below are the vocabulary; tasks put them in order.
+A primitive is planned from what is observed at its first frame, so that each one starts from where the objects really are.
+The functions under "constructors" make the primitives; a task puts them in order.
 """
 
 from __future__ import annotations
@@ -31,14 +31,21 @@ class Scene:
 class Segment:
     """``frames`` waypoints from the hands of the segment before to ``goal(scene)``.
 
-    ``jitter`` scales the demonstrator's noise; ``rigid`` gives both hands the same noise, because two stiff hands that
-    hold one body fight over every difference.
+    ``jitter`` scales the expert's noise. ``rigid`` gives both hands the same noise, because two stiff hands that hold one
+    body work against each other if they differ.
+
+    Raises:
+        ValueError: there is not one frame.
     """
 
     frames: int
     goal: Callable[[Scene], Hands]
     jitter: float = 1.0
     rigid: bool = False
+
+    def __post_init__(self) -> None:
+        if self.frames < 1:
+            raise ValueError(f"a segment of a primitive must have at least 1 frame, got {self.frames}")
 
 
 @dataclass(frozen=True)
@@ -55,7 +62,11 @@ class Primitive:
 
 @dataclass(frozen=True)
 class Noise:
-    """Variety in demonstrations: standard deviation, m, of a waypoint's offset. It is zero where a segment ends."""
+    """Variety in demonstrations: the standard deviation, m, of a waypoint's offset. The offset is zero where a segment ends.
+
+    Raises:
+        ValueError: the deviation is out of range.
+    """
 
     waypoint: float = 0.004
 
@@ -70,7 +81,10 @@ def _ease(fraction: float) -> float:
 
 
 def _offsets(segment: Segment, noise: Noise, rng: np.random.Generator) -> dict[str, NDArray[np.float64]]:
-    """Smooth random offsets (frames, 3), m, that end at zero."""
+    """Smooth random offsets (frames, 3), m, by side: n j sin(pi s) (a + b cos(pi s)), with a and b standard normal.
+
+    s runs from 1 / frames to 1, n is the noise and j the jitter. The last offset is zero.
+    """
     fractions = np.arange(1, segment.frames + 1) / segment.frames
     envelope = np.sin(np.pi * fractions)[:, None]
     offsets = {side: rng.normal(size=(2, 3)) for side in SIDES}
@@ -221,8 +235,10 @@ def place(body: str, height: float, frames: int = 12) -> Primitive:
 
 
 def lift_joined(name: str = "lift", rise: float = 0.12, squeeze: float = 0.006, frames: int = 10) -> Primitive:
-    """Raise what both hands hold between them, pressing them together by ``squeeze``, m, each, along the line between
-    the hands: bodies that are joined by nothing but a peg sag in the middle and would come apart."""
+    """Raise what both hands hold between them, each hand pressing by ``squeeze``, m, towards the other.
+
+    Bodies that only a peg joins sag in the middle and come apart without the pressure.
+    """
 
     def goal(scene: Scene) -> Hands:
         left, right = scene.hands["left"].pose, scene.hands["right"].pose
