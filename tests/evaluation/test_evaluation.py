@@ -15,11 +15,15 @@ from hdril.evaluation.evaluate import EvaluatedEpisode
 from hdril.evaluation.held_out import check_held_out, training_provenance
 from hdril.evaluation.reference import Reference, ReferenceCache
 from hdril.evaluation.score import Outcome, score_episode
+from hdril.rollout import Ending
 from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.primitives import Noise
 from hdril.trace import Trace, trace_episode
 from hdril.viewer.recordings import recording_name, write_recording
 from tests.evaluation.rerun_text import read_back, states
+
+
+SUCCEEDED = Ending(True, "", 70)
 
 
 @pytest.fixture(scope="module")
