@@ -22,7 +22,6 @@ from hdril.trace import Trace, trace_episode
 from hdril.viewer.recordings import recording_name, write_recording
 from tests.evaluation.rerun_text import read_back, states
 
-
 SUCCEEDED = Ending(True, "", 70)
 
 
