@@ -53,7 +53,8 @@ class Shards:
 
 
 def _load(path: Path, seed: int) -> Episode:
-    with np.load(path, allow_pickle=False) as data:
+    # np.load leaves a file that it opened itself open when it fails.
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
         values = {field.name: data[field.name] for field in fields(Episode)}
     if values["seed"] != seed:
         raise ValueError(f"it holds seed {values['seed']}")

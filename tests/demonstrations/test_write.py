@@ -1,0 +1,130 @@
+"""A written dataset: what each column holds, and how it is read back."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from lerobot.datasets import LeRobotDataset
+
+from hdril.demonstrations.episode import Episode
+from hdril.demonstrations.provenance import Provenance, Recipe, read_provenance
+from hdril.demonstrations.read import Signal, feature_names, read_episode, read_primitives
+from hdril.demonstrations.schema import PROPORTIONS_PATH, SUBTASKS_PATH
+from hdril.demonstrations.write import write_dataset
+from hdril.simulation.actions import ACTION_NAMES
+from hdril.tasks import TASKS
+
+Written = tuple[Path, list[Episode]]
+
+
+@pytest.fixture(scope="module")
+def written(made_up: Callable[..., Episode], tmp_path_factory: pytest.TempPathFactory) -> Written:
+    """Two episodes of different lengths; the second plays a primitive twice."""
+    root = tmp_path_factory.mktemp("written") / "set"
+    episodes = [made_up(7), made_up(9, frames=5, label=[1, 1, 0, 1, 1])]
+    write_dataset(root, Provenance(Recipe("table_lift"), (7, 9), {8: "table upright"}), episodes)
+    return root, episodes
+
+
+def test_frames_are_numbered_and_timed(written: Written) -> None:
+    data = pd.read_parquet(written[0] / "data")
+    assert data["index"].tolist() == list(range(17))
+    assert data["episode_index"].tolist() == [0] * 12 + [1] * 5
+    assert data["frame_index"].tolist() == [*range(12), *range(5)]
+    assert data["timestamp"].to_numpy() == pytest.approx([0.1 * i for i in (*range(12), *range(5))])
+    assert data["next.done"].tolist() == [i in (11, 16) for i in range(17)]
+    assert data["next.success"].tolist() == data["next.done"].tolist()
+
+
+def test_columns_are_what_was_demonstrated(written: Written) -> None:
+    root, episodes = written
+    data = pd.read_parquet(root / "data")
+    columns = {
+        "observation.state": "state", "observation.environment_state": "environment_state", "action": "action",
+        "subtask_index": "label", "next.reward": "reward",
+    }  # fmt: skip
+    for column, field in columns.items():
+        expected = np.concatenate([getattr(episode, field) for episode in episodes])
+        np.testing.assert_array_equal(np.stack(list(data[column])), expected, err_msg=column)
+
+
+def test_lerobot_reads_it_with_its_statistics(written: Written) -> None:
+    root, episodes = written
+    loaded = LeRobotDataset("any/name", root=root)
+    assert (loaded.num_episodes, loaded.num_frames, loaded.fps) == (2, 17, 10)
+    np.testing.assert_array_equal(loaded[13]["action"].numpy(), episodes[1].action[1])
+    actions = np.concatenate([episode.action for episode in episodes])
+    np.testing.assert_allclose(loaded.meta.stats["action"]["mean"], actions.mean(axis=0), rtol=1e-4, atol=1e-5)
+    assert [row["seed"] for row in loaded.meta.episodes] == [7, 9]
+
+
+def test_segments_are_runs_of_a_label_ends_included(written: Written) -> None:
+    row = LeRobotDataset("any/name", root=written[0]).meta.episodes[1]
+    assert row["dense_subtask_names"] == ["move", "grasp", "move"]
+    assert row["dense_subtask_start_frames"] == [0, 2, 3]
+    assert row["dense_subtask_end_frames"] == [1, 2, 4]
+
+
+def test_shares_of_the_primitives(written: Written) -> None:
+    task = TASKS["table_lift"]
+    shares = json.loads((written[0] / PROPORTIONS_PATH).read_text())
+    assert list(shares) == list(task.labels)
+    assert shares["grasp"] == pytest.approx(10 / 70)
+    assert sum(shares.values()) == pytest.approx(1.0)
+
+
+def test_an_episode_is_read_back(written: Written) -> None:
+    root, episodes = written
+    stored = read_episode(root, 1)
+    np.testing.assert_array_equal(stored.state, episodes[1].state)
+    np.testing.assert_array_equal(stored.action, episodes[1].action)
+    assert stored.label is not None
+    assert stored.label.tolist() == [1, 1, 0, 1, 1]
+    assert stored.primitives == TASKS["table_lift"].labels
+    assert stored.time == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    assert set(stored.signals) == {"observation.state", "observation.environment_state", "action"}
+    signal = stored.signals["observation.state"]
+    assert signal.names == ACTION_NAMES
+    assert set(signal.positions()) == {"left_ee", "right_ee"}
+    np.testing.assert_array_equal(signal.positions()["right_ee"], episodes[1].state[:, 8:11])
+
+
+def test_positions_are_those_of_whole_poses() -> None:
+    names = ("a.x", "a.y", "a.z", "b.y", "b.x", "b.z", *(f"b.q{axis}" for axis in "xyzw"), "alone")
+    signal = Signal("observation.things", names, np.arange(22.0).reshape(2, 11))
+    assert {name: values.tolist() for name, values in signal.positions().items()} == {"b": [[4, 3, 5], [15, 14, 16]]}
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["p", "q"], ("p", "q")),
+        ({"left": ["p"], "right": ["q"]}, ("p", "q")),
+        (None, ("state.0", "state.1")),
+        (["only one"], ("state.0", "state.1")),
+    ],
+)
+def test_every_number_has_a_name(names, expected: tuple[str, ...]) -> None:
+    assert feature_names("observation.state", {"names": names, "shape": [2]}) == expected
+
+
+def test_what_is_not_there_is_named(written: Written, tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="is no LeRobot dataset"):
+        read_episode(tmp_path, 0)
+    with pytest.raises(ValueError, match="has no episode 2; its episodes are 0 to 1"):
+        read_episode(written[0], 2)
+    with pytest.raises(ValueError, match=f"has no {SUBTASKS_PATH}"):
+        read_primitives(tmp_path)
+    assert read_provenance(tmp_path) is None
+
+
+def test_provenance_is_read_back(written: Written) -> None:
+    provenance = read_provenance(written[0])
+    assert provenance == Provenance(Recipe("table_lift"), (7, 9), {8: "table upright"})
+    assert provenance.first_seed == 7
+    assert Provenance(Recipe("table_lift"), (7, 9), {3: "table upright"}).first_seed == 3

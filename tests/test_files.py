@@ -1,0 +1,51 @@
+"""Files appear whole or not at all, and one process at a time works in a folder."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hdril.files import BusyError, exclusively, write_atomically
+
+
+def test_a_file_appears_whole(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "file"
+    write_atomically(path, lambda file: file.write(b"one"))
+    write_atomically(path, lambda file: file.write(b"two"))
+    assert path.read_bytes() == b"two"
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(b"old")
+
+    def fail(file) -> None:
+        file.write(b"half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_atomically(path, fail)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_second_process_is_kept_out_until_the_first_is_done(tmp_path: Path) -> None:
+    folder = tmp_path / "work"
+    code = f"from pathlib import Path; from hdril.files import exclusively\nwith exclusively(Path({str(folder)!r}), 'x'): pass"
+    other = [sys.executable, "-c", code]
+    with exclusively(folder, "baking bread"):
+        with pytest.raises(BusyError, match="another process is baking bread"), exclusively(folder, "baking bread"):
+            pass
+        assert "BusyError" in subprocess.run(other, capture_output=True, text=True, check=False).stderr
+    subprocess.run(other, check=True)
+
+
+def test_a_failure_inside_ends_the_lock(tmp_path: Path) -> None:
+    with pytest.raises(KeyError), exclusively(tmp_path, "failing"):
+        raise KeyError
+    with exclusively(tmp_path, "going on"):
+        pass
