@@ -9,7 +9,7 @@ READY := $(VENV)/.ready
 DEMO := outputs/demo
 export HF_HUB_OFFLINE ?= 1
 
-.PHONY: help setup demo test test-long bench lint types lock clean
+.PHONY: help setup demo test test-long bench docs wheels lint types lock clean
 
 help: ## What there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -39,6 +39,14 @@ test-long: $(READY) ## The tests that take longer
 
 bench: $(READY) ## Speeds, as ratios within one run
 	$(BIN)/hdril-bench
+
+docs: $(READY) ## The documentation, in outputs/docs
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs outputs/docs
+	@echo "Open outputs/docs/index.html"
+
+wheels: $(READY) ## Both distributions, in outputs/wheels
+	$(BIN)/python -m build --no-isolation --wheel --outdir outputs/wheels .
+	$(BIN)/python -m build --no-isolation --wheel --outdir outputs/wheels policies/lerobot_policy_hdril
 
 lint: $(READY) ## Formatting and lint
 	$(BIN)/ruff format --check . && $(BIN)/ruff check .
