@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import os
-import shutil
 import sys
 import time
 from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from tqdm import tqdm
 
 from hdril.cli.common import check_repo_id, run
-from hdril.evaluation.evaluate import Job, evaluate
-from hdril.evaluation.held_out import check_held_out, training_provenance
-from hdril.evaluation.report import Run, headline, write_report
+from hdril.evaluation.evaluate import Job, evaluate, make_job
+from hdril.evaluation.held_out import HeldOut, check_held_out
+from hdril.evaluation.journal import Journal
+from hdril.evaluation.lerobot_actor import foreign_primitives
+from hdril.evaluation.report import write_report
+from hdril.evaluation.results import Comparison, Run, compare, headline
 from hdril.evaluation.score import Outcome
+from hdril.evaluation.stored import StoredEvaluation, read_evaluation
+from hdril.files import MAX_SEED
 from hdril.tasks import get_task
 from hdril.viewer.keep import check_keep
 from hdril.viewer.recordings import RecordingWriter
@@ -25,10 +28,11 @@ from hdril.viewer.recordings import RecordingWriter
 
 @dataclass
 class PolicySource:
-    """Which policy. Any other --policy.… option overrides its config, e.g. --policy.rollout=open_loop."""
+    """Which policy. Any other --policy.NAME=VALUE changes its config for this evaluation, e.g. --policy.rollout=open_loop;
+    an option that the policy does not have, or that its weights have fixed, is refused."""
 
     path: str
-    """Checkpoint: a folder (…/checkpoints/last/pretrained_model) or a Hub repository."""
+    """Checkpoint: a folder (…/checkpoints/last/pretrained_model) or a repository of the Hugging Face Hub (user/name)."""
     device: str = "cpu"
     """Device of the policy in every worker."""
 
@@ -38,7 +42,8 @@ class EvalConfig:
     """Evaluate a LeRobot policy on held-out seeds: success with its 95 % interval, errors against the expert's
     demonstration of the same seed, a report, and Rerun recordings.
 
-    After Ctrl-C, the same command goes on where it was.
+    After Ctrl-C, the same command goes on where it was. Results are of weights, not of a path: to go on, to compare and to
+    publish, the weights, the config, the task, the seeds and the software must be those that made the results.
     """
 
     policy: PolicySource
@@ -48,7 +53,16 @@ class EvalConfig:
     num_episodes: int = 100
     """Episodes, one a seed."""
     seed: int = 100_000
-    """First seed. Must not overlap the seeds that the policy was trained on."""
+    """First seed. Seeds that the policy was trained on are refused."""
+    max_frames: int | None = None
+    """Frames after which an episode is cut; at least the task's horizon, which is the default. With more, a policy that
+    failed may try again."""
+    training_data: Path | None = None
+    """Folder of the dataset that the policy was trained on, if it is not found: to check that the seeds are held out. It
+    must have the statistics that the checkpoint keeps. Checkpoints of hdril know their training data."""
+    against: Path | None = None
+    """Folder of a finished evaluation of another policy on the same task and seeds: the report compares the two, seed by
+    seed."""
     rerun: str = "failures"
     """Episodes to keep as Rerun recordings: failures, all, none, or a number of episodes from the first on."""
     output_dir: Path | None = None
@@ -69,135 +83,109 @@ def _check(config: EvalConfig) -> None:
     for name, least in (("num_episodes", 1), ("seed", 0), ("workers", 1)):
         if getattr(config, name) < least:
             raise ValueError(f"{name} must be at least {least}, got {getattr(config, name)}")
+    if config.seed + config.num_episodes - 1 > MAX_SEED:
+        raise ValueError(f"the last seed must be at most {MAX_SEED}, got {config.seed + config.num_episodes - 1}")
     check_keep("rerun", config.rerun)
-    path = Path(config.policy.path)
-    looks_local = path.is_absolute() or path.parts[:1] in ((".",), ("..",)) or len(path.parts) != 2
-    if not (path / "config.json").exists() and (looks_local or path.exists()):
-        raise FileNotFoundError(
-            f"no checkpoint at {path}: it should be a folder with config.json and model.safetensors"
-        )
 
 
 def eval_command(config: EvalConfig, overrides: tuple[str, ...] = ()) -> None:
+    """Evaluate, report, and publish if asked to. Nothing is written before everything is checked."""
     _check(config)
     output = config.output_dir or Path("outputs/eval") / f"{config.task}_{time.strftime('%Y-%m-%d_%H-%M-%S')}"
     if output.exists() and not config.push:
         raise FileExistsError(f"{output} exists; choose another output_dir or delete it")
-    seeds = list(range(config.seed, config.seed + config.num_episodes))
-    held_out = check_held_out(training_provenance(config.policy.path), config.task, seeds)
-    if not held_out:
-        print(
-            f"Note: the training data of {config.policy.path} are not at hand; whether these seeds were in them is not known."
-        )
-    what = Run(config.task, config.policy.path, overrides, config.seed, config.num_episodes, held_out)
+    job = make_job(
+        config.task, config.policy.path, config.seed, config.num_episodes, overrides=overrides,
+        device=config.policy.device, max_frames=config.max_frames,
+    )  # fmt: skip
+    held_out = check_held_out(job.checkpoint, config.task, job.seeds, config.training_data)
+    if not held_out.known:
+        print(f"Note: whether these seeds are held out is not known: {held_out.basis}.")
     if output.exists():
-        _check_same(output, what)
-        _push(config, output)
-        return
-    partial = output.with_name(output.name + ".partial")
-    done = _resume(partial, what)
-    job = Job(config.task, config.policy.path, overrides, config.policy.device)
-    writer = RecordingWriter(partial / "rerun", config.rerun, config.seed) if config.rerun != "none" else None
-    start = time.monotonic()
-    outcomes = [done[seed] for seed in seeds if seed in done]
-    left = [seed for seed in seeds if seed not in done]
-    try:
-        _play(job, left, min(config.workers, max(len(left), 1)), writer, outcomes, partial / "outcomes.jsonl")
-    except Exception:
-        if not outcomes:  # nothing to go on from
-            shutil.rmtree(partial)
-        raise
-    outcomes.sort(key=lambda outcome: outcome.seed)
-    summary = write_report(partial, what, outcomes)
-    (partial / "run.json").unlink()
-    (partial / "outcomes.jsonl").unlink()
-    output.parent.mkdir(parents=True, exist_ok=True)
-    partial.replace(output)
+        _check_finished(read_evaluation(output), config, job)
+    else:
+        _evaluate(config, job, describe(job, held_out), output)
+    if config.push:
+        _push(config, job, output)
+
+
+def describe(job: Job, held_out: HeldOut) -> Run:
+    """What the report says of an evaluation, the results aside."""
+    trials, task = job.identity.trials, get_task(job.task)
+    foreign = foreign_primitives(job.checkpoint, task)
+    note = f"Not of this task are the policy's primitives {', '.join(foreign)}: its planner is not scored."
+    return Run(
+        task=job.task,
+        policy=job.checkpoint.name,
+        overrides=job.overrides,
+        first_seed=trials.first_seed,
+        num_episodes=trials.num_episodes,
+        held_out=held_out.known,
+        held_out_basis=held_out.basis,
+        max_frames=0 if trials.max_frames == task.horizon else trials.max_frames,
+        notes=(note,) if foreign else (),
+        identity=job.identity.as_dict(),
+    )
+
+
+def _check_finished(evaluation: StoredEvaluation, config: EvalConfig, job: Job) -> None:
+    """Raises ValueError unless a finished evaluation is the one that is asked for."""
+    evaluation.require(job.identity)
+    if config.against is not None and not evaluation.results.get("comparison"):
+        raise ValueError(f"{evaluation.folder} compares with no other evaluation; evaluate again with --against")
+
+
+def _evaluate(config: EvalConfig, job: Job, what: Run, output: Path) -> None:
+    against = _read_other(config.against, job)
+    journal, start = Journal(output, job.identity), time.monotonic()
+    _play(config, job, journal)
+    outcomes = sorted(journal.done.values(), key=lambda outcome: outcome.seed)
+    summary = write_report(journal.folder, what, outcomes, _compare(outcomes, against))
+    journal.finish()
     recordings = sorted((output / "rerun").glob("*.rrd")) if (output / "rerun").exists() else []
     print(f"{headline(summary)}; {time.monotonic() - start:.0f} s")
     print(f"Report: {output / 'report.md'}")
     if recordings:
         print(f"{len(recordings)} recordings: hdril-view --run={output}")
-    if config.push:
-        _push(config, output)
 
 
-def _check_same(output: Path, what: Run) -> None:
-    """Raises FileExistsError unless ``output`` holds the results of ``what``."""
-    path = output / "results.json"
-    values = json.loads(path.read_text()) if path.exists() else {}
-    if any(values.get(name) != value for name, value in json.loads(json.dumps(asdict(what))).items()):
-        raise FileExistsError(f"{output} exists and holds something else; choose another output_dir or delete it")
+def _read_other(folder: Path | None, job: Job) -> StoredEvaluation | None:
+    """The evaluation to compare with. Raises ValueError unless it is of the same trials."""
+    if folder is None:
+        return None
+    other = read_evaluation(folder)
+    other.require_trials(job.identity.trials)
+    return other
 
 
-def _push(config: EvalConfig, output: Path) -> None:
-    """Results and report, the card, and the checkpoint if it lies here, in one commit."""
-    from huggingface_hub import ModelCard
-
-    from hdril.hub.cards import checkpoint_card, folder_of, with_evaluation
-    from hdril.hub.publish import publish, read_text
-
-    summary = json.loads((output / "results.json").read_text())
-    folder, checkpoint = folder_of(summary), Path(config.policy.path)
-    files: dict[str, Path | bytes] = {
-        f"{folder}/{name}": output / name for name in ("results.json", "report.md", "report.png")
-    }
-    if config.output_dir is None:  # the default is another one each time
-        print(f"Publishing {output}; should that fail, add --output_dir={output} to push it without playing anew")
-    text = read_text(config.push, "README.md", "model")
-    if (checkpoint / "config.json").exists():
-        # What LeRobot publishes of a checkpoint: no pickles.
-        files |= {path.name: path for path in checkpoint.iterdir() if path.suffix in (".safetensors", ".json", ".yaml")}
-        text = text or checkpoint_card(checkpoint, config.push)
-    card = with_evaluation(ModelCard(text or f"# {config.push}\n"), summary, config.push)
-    files["README.md"] = str(card).encode()
-    print(f"Published: {publish(config.push, 'model', files, headline(summary), config.private)}")
+def _compare(outcomes: list[Outcome], against: StoredEvaluation | None) -> Comparison | None:
+    return None if against is None else compare(against.results["policy"], outcomes, against.results)
 
 
-def _play(
-    job: Job,
-    seeds: list[int],
-    workers: int,
-    writer: RecordingWriter | None,
-    outcomes: list[Outcome],
-    journal: Path,
-) -> None:
-    """Evaluate ``seeds``, adding to ``outcomes`` and to the journal as they come."""
+def _play(config: EvalConfig, job: Job, journal: Journal) -> None:
+    """Play the seeds that are left, adding to the journal as they come."""
+    left = [seed for seed in job.seeds if seed not in journal.done]
+    if not left:
+        return
+    writer = RecordingWriter(journal.folder / "rerun", config.rerun, config.seed) if config.rerun != "none" else None
     with (
-        journal.open("a") as file,
-        tqdm(
-            total=len(seeds) + len(outcomes), initial=len(outcomes), desc=f"evaluating {job.task}", unit="episode"
-        ) as bar,
-        closing(evaluate(job, seeds, workers, writer)) as stream,
+        journal.writing() as add,
+        tqdm(total=len(job.seeds), initial=len(journal.done), desc=f"evaluating {job.task}", unit="episode") as bar,
+        closing(evaluate(job, left, min(config.workers, len(left)), writer)) as stream,
     ):
         for outcome in stream:
-            file.write(json.dumps(asdict(outcome)) + "\n")
-            file.flush()
-            outcomes.append(outcome)
-            bar.set_postfix(success=f"{100 * sum(o.success for o in outcomes) / len(outcomes):.1f}%", refresh=False)
+            add(outcome)
+            successes = sum(entry.success for entry in journal.done.values())
+            bar.set_postfix(success=f"{100 * successes / len(journal.done):.1f}%", refresh=False)
             bar.update()
 
 
-def _resume(partial: Path, what: Run) -> dict[int, Outcome]:
-    """Outcomes of an interrupted evaluation of the same thing.
+def _push(config: EvalConfig, job: Job, output: Path) -> None:
+    from hdril.hub.evaluations import publish_evaluation
 
-    Raises:
-        ValueError: the folder holds a different one.
-    """
-    plan, journal = partial / "run.json", partial / "outcomes.jsonl"
-    text = json.dumps(asdict(what))
-    if plan.exists() and plan.read_text() != text:
-        raise ValueError(f"{partial} holds another unfinished evaluation; delete it or choose another output_dir")
-    partial.mkdir(parents=True, exist_ok=True)
-    plan.write_text(text)
-    outcomes: dict[int, Outcome] = {}
-    if journal.exists():
-        for line in journal.read_text().splitlines():
-            values = json.loads(line)
-            outcomes[values["seed"]] = Outcome(
-                **values | {"start": tuple(values["start"]), "primitives": tuple(values["primitives"])}
-            )
-    return outcomes
+    if config.output_dir is None:  # the default is another one each time
+        print(f"Publishing {output}; should that fail, add --output_dir={output} to push it without playing anew")
+    print(f"Published: {publish_evaluation(config.push, job, read_evaluation(output), config.private)}")
 
 
 def split_overrides(arguments: list[str]) -> tuple[list[str], tuple[str, ...]]:

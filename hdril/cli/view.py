@@ -14,7 +14,8 @@ from urllib.parse import quote
 
 from hdril.cli.common import run
 from hdril.errors import UserError
-from hdril.viewer.episodes import Evaluation, compare, replay, show_dataset
+from hdril.evaluation.stored import read_evaluation
+from hdril.viewer.episodes import compare, find_recordings, replay, show_dataset
 
 MADE = Path("outputs/view")
 
@@ -32,7 +33,8 @@ class ViewConfig:
     against: Path | None = None
     """Folder of another evaluation, of the same task: both policies play the seed, and are shown side by side."""
     seed: int | None = None
-    """Seed of the episode. One that was not recorded is played again. Default: all that were recorded."""
+    """Seed of the episode. One that was not recorded is played again, if the checkpoint is still the one that was evaluated.
+    Default: all that were recorded."""
     dataset: Path | None = None
     """Root of a LeRobot dataset."""
     episode: int = 0
@@ -66,11 +68,11 @@ def recordings(config: ViewConfig) -> list[Path]:
         print(f"Episode {config.episode}: {line}")
         return [path]
     assert config.run is not None
-    evaluation = Evaluation(config.run)
+    evaluation = read_evaluation(config.run)
     if config.against is not None and config.seed is not None:
         made = config.save or MADE / f"compare_seed_{config.seed:07d}.rrd"
-        return [compare(evaluation, Evaluation(config.against), config.seed, made)]
-    found = evaluation.recordings(config.seed)
+        return [compare(evaluation, read_evaluation(config.against), config.seed, made)]
+    found = find_recordings(config.run, config.seed)
     if not found and config.seed is None:
         results = evaluation.results
         raise FileNotFoundError(
@@ -79,7 +81,10 @@ def recordings(config: ViewConfig) -> list[Path]:
         )
     if not found and config.seed is not None:
         print(f"Seed {config.seed} was not recorded: playing it again")
-        return [replay(evaluation, config.seed, config.save or MADE / f"seed_{config.seed:07d}.rrd")]
+        path, changed = replay(evaluation, config.seed, config.save or MADE / f"seed_{config.seed:07d}.rrd")
+        if changed:
+            print(f"Note: the episode may differ from the one that was evaluated: other {', '.join(changed)}.")
+        return [path]
     if config.save is None:
         return found
     config.save.parent.mkdir(parents=True, exist_ok=True)

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 
 from hdril.env import BimanualEnv
-from hdril.evaluation.lerobot_actor import LeRobotActor
+from hdril.evaluation.checkpoint import Checkpoint, find_checkpoint, identify, resolve_config
+from hdril.evaluation.identity import Identity, identify_trials
+from hdril.evaluation.lerobot_actor import LeRobotActor, foreign_primitives
 from hdril.evaluation.reference import Reference, ReferenceCache
 from hdril.evaluation.score import Outcome, score_episode
 from hdril.trace import Trace, trace_episode
@@ -23,6 +25,8 @@ class EvaluatedEpisode:
     outcome: Outcome
     trace: Trace
     reference: Reference
+    identity: Identity | None = None
+    """What played it; None where that is not a checkpoint."""
 
 
 EpisodeSink = Callable[[EvaluatedEpisode], object]
@@ -31,42 +35,94 @@ EpisodeSink = Callable[[EvaluatedEpisode], object]
 
 @dataclass(frozen=True)
 class Job:
-    """What to evaluate: a policy on a task."""
+    """What to evaluate: a checkpoint on a task, and what both were when the evaluation began."""
 
     task: str
-    policy: str
+    """The task's name, as it was given."""
+    checkpoint: Checkpoint
+    identity: Identity
     overrides: tuple[str, ...] = ()
-    device: str = "cpu"
+
+    @property
+    def seeds(self) -> list[int]:
+        trials = self.identity.trials
+        return list(range(trials.first_seed, trials.first_seed + trials.num_episodes))
+
+
+def make_job(
+    task: str,
+    policy: str | Checkpoint,
+    first_seed: int,
+    num_episodes: int,
+    *,
+    overrides: tuple[str, ...] = (),
+    device: str = "cpu",
+    max_frames: int | None = None,
+) -> Job:
+    """Find and check all that an evaluation needs; nothing is written.
+
+    Args:
+        task: its name, with parameters if there are any.
+        policy: a checkpoint's folder, or a repository of the Hub.
+        first_seed: of ``num_episodes`` seeds in a row.
+        overrides: changes of the policy's config, as ``--name=value``.
+        device: of the policy.
+        max_frames: frames after which an episode is cut; the task's horizon unless given.
+
+    Raises:
+        FileNotFoundError: there is no such checkpoint.
+        ValueError: something is invalid or damaged; says what, and the valid choices.
+    """
+    checkpoint = find_checkpoint(policy) if isinstance(policy, str) else policy
+    trials = identify_trials(task, first_seed, num_episodes, max_frames)
+    identity = Identity(identify(checkpoint, resolve_config(checkpoint, overrides, device)), trials)
+    return Job(task, checkpoint, identity, overrides)
 
 
 @dataclass
 class Worker:
-    """One process: an environment, the expert, and the policy."""
+    """One process: an environment, the expert, and the policy.
+
+    Raises:
+        ValueError: the checkpoint is not what it was when the evaluation began.
+    """
 
     job: Job
     env: BimanualEnv = field(init=False)
 
     def __post_init__(self) -> None:
-        self.env = BimanualEnv(self.job.task)
-        self._references = ReferenceCache(self.env)
-        self._actor = LeRobotActor(self.job.policy, self.env.task_spec, self.job.overrides, self.job.device)
+        identity = self.job.identity
+        self.env = BimanualEnv(self.job.task, max_episode_steps=identity.trials.max_frames)
+        self._references = ReferenceCache(self.job.task)
+        self._actor = LeRobotActor(
+            self.job.checkpoint, self.env.task_spec, self.job.overrides, identity.policy.device, identity.policy
+        )
+        self._foreign = foreign_primitives(self.job.checkpoint, self.env.task_spec)
 
     def play(self, seed: int) -> EvaluatedEpisode:
         """Expert and policy on the scene of ``seed``."""
         reference = self._references.get(seed)
         trace, ending = trace_episode(self.env, self._actor, seed, reference.scripted)
         outcome = score_episode(self.env.task_spec, seed, trace, reference, ending)
-        return EvaluatedEpisode(self.env, outcome, trace, reference)
+        if self._foreign:
+            outcome = _without_planner(outcome)
+        return EvaluatedEpisode(self.env, outcome, trace, reference, self.job.identity)
 
 
-_workers: dict[Job, Worker] = {}
+def _without_planner(outcome: Outcome) -> Outcome:
+    """The planner chose among primitives that the expert does not know: neither its order nor its hits can be told."""
+    return replace(outcome, primitives=(), planner_confusion=[], planner_boundary_hits=[])
+
+
+_workers: dict[str, Worker] = {}
 
 
 def _work(job: Job, seed: int, sink: EpisodeSink | None) -> Outcome:
     # Built by the first call and not by the pool's initializer, whose errors reach nobody.
-    if job not in _workers:
-        _workers[job] = Worker(job)
-    return _finish(_workers[job].play(seed), sink)
+    key = repr(job)
+    if key not in _workers:
+        _workers[key] = Worker(job)
+    return _finish(_workers[key].play(seed), sink)
 
 
 def _finish(episode: EvaluatedEpisode, sink: EpisodeSink | None) -> Outcome:

@@ -7,40 +7,51 @@ from typing import Any
 import numpy as np
 
 from hdril.actor import Decision, Explanation, Observation
-from hdril.simulation.actions import ACTION_NAMES
+from hdril.evaluation.checkpoint import Checkpoint, find_checkpoint, identify, resolve_config
+from hdril.evaluation.identity import PolicyIdentity, differences
 from hdril.tasks import Task
 
 
 class LeRobotActor:
     """A LeRobot checkpoint, with its processors, acting on one environment.
 
+    Args:
+        checkpoint: a folder, or a repository of the Hub.
+        task: what it acts on.
+        overrides: changes of the policy's config, as ``--name=value``.
+        device: of the policy.
+        expected: what the checkpoint was when the evaluation began; training may have written over it since.
+
     Raises:
         FileNotFoundError: there is no such checkpoint.
-        ValueError: the checkpoint does not fit the environment.
+        ValueError: the checkpoint is damaged, is not the expected one, or does not fit the environment.
     """
 
-    def __init__(self, path: str, task: Task, overrides: tuple[str, ...] = (), device: str = "cpu") -> None:
+    def __init__(
+        self,
+        checkpoint: str | Checkpoint,
+        task: Task,
+        overrides: tuple[str, ...] = (),
+        device: str = "cpu",
+        expected: PolicyIdentity | None = None,
+    ) -> None:
         import torch
-        from lerobot.configs.policies import PreTrainedConfig
-        from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+        from lerobot.policies.factory import make_pre_post_processors
 
-        # Registers the policy types of lerobot_policy_* distributions.
-        from lerobot.utils.import_utils import register_third_party_plugins
-
-        register_third_party_plugins()
         torch.set_num_threads(1)
-        config = PreTrainedConfig.from_pretrained(path, cli_overrides=[*overrides, f"--device={device}"])
-        self.policy = get_policy_class(config.type).from_pretrained(path, config=config)
+        found = find_checkpoint(checkpoint) if isinstance(checkpoint, str) else checkpoint
+        config = resolve_config(found, overrides, device)
+        self.policy = _load_policy(found, config)
         self._before, self._after = make_pre_post_processors(
-            config, pretrained_path=path, preprocessor_overrides={"device_processor": {"device": device}}
+            config,
+            pretrained_path=str(found.folder),
+            preprocessor_overrides={"device_processor": {"device": device}},
         )
-        self._torch = torch
-        self._description = task.description
-        # Columns of the policy's primitives among the task's labels.
-        primitives = getattr(config, "primitives", None) or []
-        self._labels = np.array([task.labels.index(name) if name in task.labels else -1 for name in primitives])
-        self._count = len(task.labels)
-        self._believes = bool(primitives) and hasattr(self.policy, "attention")
+        # After loading, not before: whatever was loaded, a file that is the expected one now was so then.
+        if expected is not None:
+            _check_unchanged(found, expected, identify(found, config))
+        self._torch, self._task = torch, task
+        self._explains = hasattr(self.policy, "explain")
 
     def reset(self, seed: int) -> None:
         """Begin an episode; a policy that samples draws the same numbers for the same seed."""
@@ -48,26 +59,48 @@ class LeRobotActor:
         self.policy.reset()
 
     def act(self, observation: Observation) -> Decision:
-        """The action for an observation, and what the policy thinks if it has primitives."""
+        """The action for an observation, and why the policy chose it, if it can tell."""
         from lerobot.envs.utils import preprocess_observation
 
         batch: dict[str, Any] = preprocess_observation(dict(observation))
-        batch["task"] = [self._description]
+        batch["task"] = [self._task.description]
         with self._torch.inference_mode():
             action = self._after(self.policy.select_action(self._before(batch)))
-            return Decision(action[0].numpy().astype(np.float32), self._explain())
+            return Decision(action[0].numpy(force=True).astype(np.float32), self._explain())
 
     def _explain(self) -> Explanation | None:
-        rollout: Any = getattr(self.policy, "rollout", None)
-        if not self._believes or rollout is None:
+        """What the policy's ``explain()`` says, in labels of the task; None for policies that have none."""
+        told = self.policy.explain() if self._explains else None
+        if told is None:
             return None
-        probabilities = np.zeros(self._count, np.float32)
-        known = self._labels >= 0
-        probabilities[self._labels[known]] = rollout.probabilities[0].cpu().numpy()[known]
-        plan = rollout.plan[0, :, : len(ACTION_NAMES)].cpu().numpy().copy() if bool(rollout.replanned[0]) else None
-        if plan is not None:
-            # The plan ends with the longest recorded form of this primitive.
-            plan = plan[: max(1, int(self.policy.longest_length[rollout.primitive[0]] - rollout.plan_start[0]))]  # pyright: ignore
-        received = self.policy.attention().received()  # pyright: ignore
-        attention = {name: float(share[0]) for name, share in received.items()}
-        return Explanation(int(self._labels[int(rollout.primitive[0])]), probabilities, plan, attention)
+        labels = self._task.labels
+        probabilities = np.array([told.probabilities.get(name, 0.0) for name in labels], np.float32)
+        executed = labels.index(told.primitive) if told.primitive in labels else -1
+        return Explanation(executed, probabilities, told.plan, dict(told.attention), tuple(told.events))
+
+
+def foreign_primitives(checkpoint: Checkpoint, task: Task) -> tuple[str, ...]:
+    """The primitives of a policy that are none of the task's."""
+    primitives = checkpoint.read_config().get("primitives") or ()
+    return tuple(name for name in primitives if name not in task.labels)
+
+
+def _load_policy(checkpoint: Checkpoint, config: Any) -> Any:
+    """The policy with all its weights and no others: LeRobot by itself logs what is missing, and leaves it random."""
+    from lerobot.policies.factory import get_policy_class
+
+    try:
+        return get_policy_class(config.type).from_pretrained(str(checkpoint.folder), config=config, strict=True)
+    except RuntimeError as error:
+        if "loading state_dict" not in str(error):
+            raise
+        _, _, reason = str(error).partition(":")
+        raise ValueError(f"{checkpoint.weights} does not fit the policy's config: {' '.join(reason.split())}") from None
+
+
+def _check_unchanged(checkpoint: Checkpoint, expected: PolicyIdentity, found: PolicyIdentity) -> None:
+    if changed := differences(vars(expected), vars(found)):
+        raise ValueError(
+            f"the checkpoint {checkpoint.name} was written over since the evaluation began: other {', '.join(changed)}; "
+            "evaluate a copy, or a checkpoint that training does not change"
+        )

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-import hdril
 from hdril.env import BimanualEnv
+from hdril.evaluation.identity import digest_json, task_parameters
+from hdril.evaluation.software import digest_file, episode_software
 from hdril.files import cache_folder, write_atomically
 from hdril.rollout import Ending
+from hdril.tasks import base_name
 from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.primitives import Noise
 from hdril.trace import Trace, trace_episode
@@ -37,18 +39,19 @@ class Reference:
 
 
 class ReferenceCache:
-    """The expert's episodes on disk, by seed: several policies on the same seeds need each of them once.
+    """The expert's episodes of a task on disk, by seed: several policies on the same seeds need each of them once.
 
-    They lie in ``$XDG_CACHE_HOME/hdril/expert`` (``~/.cache`` unless set), under a digest of the task and of this
-    package's source: another version of the code plays them anew.
+    They lie in ``$XDG_CACHE_HOME/hdril/expert`` (``~/.cache`` unless set), under a digest of the task, of the sources that
+    decide an episode, and of the simulator's and the robot model's versions: where one of them differs, they are played anew.
     """
 
-    def __init__(self, env: BimanualEnv) -> None:
-        self._env, self._expert = env, ScriptedExpert(env.task_spec, Noise(0.0))
-        digest = hashlib.sha256(env.task.encode())
-        for file in sorted(Path(hdril.__file__).parent.rglob("*.py")):
-            digest.update(file.read_bytes())
-        self._folder = cache_folder() / "expert" / digest.hexdigest()[:16]
+    def __init__(self, task: str) -> None:
+        # An environment of its own: that of the policy may cut episodes later, where the expert has no more to do.
+        self._env = BimanualEnv(task)
+        self._expert = ScriptedExpert(self._env.task_spec, Noise(0.0))
+        made_by = episode_software(base_name(task)) | {"reference": digest_file(Path(__file__))}
+        digest = digest_json([base_name(task), task_parameters(task), made_by])
+        self._folder = cache_folder() / "expert" / digest[:16]
 
     def get(self, seed: int) -> Reference:
         """The expert's episode of this seed, played now unless it is there."""
@@ -56,8 +59,13 @@ class ReferenceCache:
         if path.exists():
             with np.load(path) as data:
                 return Reference(
-                    data["state"], data["environment_state"], data["scripted"], bool(data["success"]), str(data["unmet"])
+                    data["state"],
+                    data["environment_state"],
+                    data["scripted"],
+                    bool(data["success"]),
+                    str(data["unmet"]),
                 )
-        reference = Reference.of(*trace_episode(self._env, self._expert, seed))
+        with closing(self._env):
+            reference = Reference.of(*trace_episode(self._env, self._expert, seed))
         write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **vars(reference)))
         return reference

@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from huggingface_hub import EvalResult, ModelCard
-from lerobot_policy_hdril.card import CITATION, EVALUATION, table
+from lerobot_policy_hdril.card import CITATION, EVALUATION
 
 from hdril.demonstrations.provenance import RECIPE_PATH, read_provenance
 from hdril.demonstrations.schema import features
-from hdril.evaluation.report import headline
+from hdril.evaluation.results import headline
+from hdril.evaluation.software import SHORT
+from hdril.markdown import table
 from hdril.tasks import base_name, get_task
 
 PAPER = "https://arxiv.org/abs/2010.05134"
@@ -102,32 +104,65 @@ lerobot-dataset-viz --repo-id={repo_id} --episode-index=0
 
 
 def evaluation_section(summary: dict[str, Any], repo_id: str) -> str:
-    """The results of an evaluation as text: rate, interval, errors, and the commands that give it."""
-    task, options = summary["task"], " ".join(f"--policy.{o.removeprefix('--')}" for o in summary["overrides"])
+    """The results of an evaluation as text: rate, interval, errors, what made them, and the commands that give them."""
+    task = summary["task"]
     low, high = summary["pc_success_ci95"]
     row = (
-        f"`{task}`", f"{summary['n_success']} of {summary['n_episodes']}", f"{summary['pc_success']:.1f} %",
-        f"{low:.1f} to {high:.1f} %", f"{summary['position_error_cm']['mean']:.2f} cm",
-        f"{summary['angle_error_rad']['mean']:.4f} rad", f"{summary['dtw_cm']['mean']:.2f} cm",
-    )  # fmt: skip
-    held_out = (
-        "None of these seeds was in the training data."
-        if summary["held_out"]
-        else "Whether these seeds were in the training data is not known."
+        f"`{task}`",
+        f"{summary['n_success']} of {summary['n_episodes']}",
+        f"{summary['pc_success']:.1f} %",
+        f"{low:.1f} to {high:.1f} %",
+        _mean(summary["position_error_cm"], 2, "cm"),
+        _mean(summary["angle_error_rad"], 4, "rad"),
+        _mean(summary["dtw_cm"], 2, "cm"),
     )
-    command = f"hdril-eval --policy.path={repo_id} --task={task} --num_episodes={summary['n_episodes']} "
-    stock = f"lerobot-eval --policy.path={repo_id} --env.type=hdril --env.task={task} --eval.n_episodes={summary['n_episodes']} "
-    return f"""{headline(summary)}. {held_out} Errors are against the noise-free expert on the same seed.
+    heads = ("task", "succeeded", "rate", "95 % interval", "position error", "angle error", "DTW")
+    return f"""{headline(summary)}. {_held_out(summary)} Errors are against the noise-free expert on the same seed.
 
-{table(("task", "succeeded", "rate", "95 % interval", "position error", "angle error", "DTW"), [row])}
+{table(heads, [row])}
+
+{_made_by(summary["identity"])}
 
 ```
-{(command + f"--seed={summary['first_seed']} {options}").strip()}
-{(stock + f"--eval.batch_size=1 --seed={summary['first_seed']} {options}").strip()}
+{_commands(summary, repo_id)}
 ```
 
 Seed by seed: `{folder_of(summary)}/results.json`.
 """
+
+
+def _mean(spread: dict[str, float] | None, digits: int, unit: str) -> str:
+    """Empty where there is nothing to compare with: the expert solved none of the seeds."""
+    return "" if spread is None else f"{spread['mean']:.{digits}f} {unit}"
+
+
+def _held_out(summary: dict[str, Any]) -> str:
+    known = "The seeds are held out" if summary["held_out"] else "Whether the seeds are held out is not known"
+    return f"{known}: {summary['held_out_basis']}."
+
+
+def _made_by(identity: dict[str, Any]) -> str:
+    """Weights and software, in one sentence."""
+    policy, trials = identity["policy"], identity["trials"]
+    software = ", ".join(f"{name} {version}" for name, version in (policy["software"] | trials["software"]).items())
+    return (
+        f"Evaluated: weights with the SHA-256 `{policy['weights'][:SHORT]}…`, on {policy['device']}, with {software}."
+    )
+
+
+def _commands(summary: dict[str, Any], repo_id: str) -> str:
+    """The same evaluation with hdril's command and with LeRobot's."""
+    task, count, seed = summary["task"], summary["n_episodes"], summary["first_seed"]
+    options = "".join(f" --policy.{option.removeprefix('--')}" for option in summary["overrides"])
+    frames = summary["max_frames"]
+    ours, theirs = (f" --max_frames={frames}", f" --env.episode_length={frames}") if frames else ("", "")
+    return "\n".join(
+        (
+            f"hdril-eval --policy.path={repo_id} --task={task} --num_episodes={count} --seed={seed}{ours}{options}",
+            f"lerobot-eval --policy.path={repo_id} --env.type=hdril --env.task={task} --eval.n_episodes={count} "
+            f"--eval.batch_size=1 --seed={seed}{theirs}{options}",
+        )
+    )
 
 
 def folder_of(summary: dict[str, Any]) -> str:
@@ -149,7 +184,7 @@ def with_evaluation(card: ModelCard, summary: dict[str, Any], repo_id: str) -> M
         task_type="robotics", dataset_type="hdril", dataset_name=summary["task"], metric_type="success_rate",
         metric_name="success rate, %", metric_value=round(summary["pc_success"], 2),
     )  # fmt: skip
-    data = card.data
+    data: Any = card.data  # its fields are those of a model's card
     data.model_name = data.model_name or repo_id.split("/")[-1]
     others = [r for r in data.eval_results or [] if r.dataset_name != summary["task"]]
     data.eval_results = [*others, result]

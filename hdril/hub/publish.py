@@ -142,20 +142,26 @@ def publish(
     return str(commit.repo_url)
 
 
-def read_text(repo_id: str, path: str, repo_type: str) -> str | None:
-    """A text file of a repository; None if there is none, or no such repository.
+def download(repo_id: str, path: str, repo_type: str) -> Path | None:
+    """A file of a repository, in the local cache; None if there is none, or no such repository.
 
     Raises:
-        HubError: the Hub cannot be reached, or refused.
+        HubError: the Hub cannot be reached, or refuses.
     """
 
-    def read() -> str | None:
+    def fetch() -> Path | None:
         try:
-            return Path(hf_hub_download(repo_id, path, repo_type=repo_type)).read_text()
+            return Path(hf_hub_download(repo_id, path, repo_type=repo_type))
         except (RemoteEntryNotFoundError, RepositoryNotFoundError):
             return None
 
     # Checked first: offline, the download says only that the file is not in the cache.
     if is_offline_mode():
         raise HubError(f"could not read {path} of {repo_id}: {_explain(OfflineModeIsEnabled())}")
-    return _try(read, f"read {path} of {repo_id}", "Nothing was published; the same command tries again.")
+    return _try(fetch, f"read {path} of {repo_id}", "Nothing was published; the same command tries again.")
+
+
+def read_text(repo_id: str, path: str, repo_type: str) -> str | None:
+    """A text file of a repository; None if there is none. Raises as :func:`download`."""
+    file = download(repo_id, path, repo_type)
+    return None if file is None else file.read_text()

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import re
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,67 +14,55 @@ import rerun.blueprint as rrb
 from hdril.actor import ReplayActor
 from hdril.demonstrations.provenance import Provenance, read_provenance
 from hdril.demonstrations.read import StoredEpisode, read_episode
-from hdril.env import BimanualEnv
-from hdril.evaluation.evaluate import EvaluatedEpisode, Job, Worker
+from hdril.evaluation.evaluate import EvaluatedEpisode, Worker
+from hdril.evaluation.identity import require_same
 from hdril.evaluation.reference import ReferenceCache
 from hdril.evaluation.score import score_episode
+from hdril.evaluation.stored import StoredEvaluation
 from hdril.trace import trace_episode
 from hdril.viewer.log import TIMELINE, log_lane
 from hdril.viewer.recordings import APPLICATION, recording_name, write_episodes
 
-RESULTS = "results.json"
+
+def find_recordings(folder: Path, seed: int | None = None) -> list[Path]:
+    """The recordings of an evaluation, in the order of seeds; of one seed if that is given."""
+    pattern = "seed_*.rrd" if seed is None else f"seed_{seed:07d}_*.rrd"
+    return sorted((folder / "rerun").glob(pattern))
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """An evaluation on disk: the folder that ``hdril-eval`` wrote.
+def replay(evaluation: StoredEvaluation, seed: int, path: Path) -> tuple[Path, list[str]]:
+    """Play a seed again, and write its recording to ``path``.
+
+    Returns:
+        The path, and the software that is another one than then: unless that is empty, the episode may be another one, too.
 
     Raises:
-        FileNotFoundError: there is none.
+        ValueError: the checkpoint is no longer the one that was evaluated.
     """
-
-    folder: Path
-
-    def __post_init__(self) -> None:
-        if not (self.folder / RESULTS).exists():
-            raise FileNotFoundError(f"{self.folder} holds no {RESULTS}: give the output_dir of a finished hdril-eval")
-
-    @property
-    def results(self) -> dict[str, Any]:
-        return json.loads((self.folder / RESULTS).read_text())
-
-    def recordings(self, seed: int | None = None) -> list[Path]:
-        """Its recordings, in the order of seeds; of one seed if that is given."""
-        pattern = "seed_*.rrd" if seed is None else f"seed_{seed:07d}_*.rrd"
-        return sorted((self.folder / "rerun").glob(pattern))
-
-    def worker(self) -> Worker:
-        """Ready to play any seed as it was played then."""
-        values = self.results
-        return Worker(Job(values["task"], values["policy"], tuple(values["overrides"])))
-
-
-def replay(evaluation: Evaluation, seed: int, path: Path) -> Path:
-    """Play a seed again, which gives the same episode, and write its recording to ``path``."""
-    worker = evaluation.worker()
+    job = evaluation.job()
+    worker = Worker(job)
     with closing(worker.env):
         episode = worker.play(seed)
-        return write_episodes(path, recording_name(episode.outcome), {"": episode})
+        write_episodes(path, recording_name(episode.outcome), {"": episode})
+    return path, evaluation.changed_software(job)
 
 
-def compare(first: Evaluation, second: Evaluation, seed: int, path: Path) -> Path:
+def compare(first: StoredEvaluation, second: StoredEvaluation, seed: int, path: Path) -> Path:
     """Play a seed with the policies of two evaluations, and write both episodes into one recording, side by side.
 
     Raises:
-        ValueError: the evaluations are of different tasks.
+        ValueError: the evaluations are of different trials, or a checkpoint is no longer the one that was evaluated.
     """
-    tasks = [evaluation.results["task"] for evaluation in (first, second)]
-    if tasks[0] != tasks[1]:
-        raise ValueError(f"{first.folder} is of the task {tasks[0]!r}, {second.folder} of {tasks[1]!r}")
+    jobs = [evaluation.job() for evaluation in (first, second)]
+    # Both are played with the software of now, on this seed: what is left to differ is the task and the budget.
+    one, other = (
+        {name: getattr(job.identity.trials, name) for name in ("task", "parameters", "max_frames")} for job in jobs
+    )
+    require_same(str(second.folder), other, one, f"compare evaluations of what {first.folder} is of")
     with ExitStack() as worlds:
         episodes: dict[str, EvaluatedEpisode] = {}
-        for evaluation, name in zip((first, second), _names(first.folder, second.folder), strict=True):
-            worker = evaluation.worker()
+        for job, name in zip(jobs, _names(first.folder, second.folder), strict=True):
+            worker = Worker(job)
             worlds.enter_context(closing(worker.env))
             episodes[name] = worker.play(seed)
         return write_episodes(path, f"seed_{seed:07d}", episodes)
@@ -115,7 +101,7 @@ def _own(provenance: Provenance, episode: int, stored: StoredEpisode, path: Path
     actions = ReplayActor(stored.action)
     env = provenance.recipe.make_env()
     with closing(env):
-        reference = ReferenceCache(BimanualEnv(provenance.recipe.task)).get(seed)
+        reference = ReferenceCache(provenance.recipe.task).get(seed)
         trace, ending = trace_episode(env, actions, seed, stored.label)
         outcome = score_episode(env.task_spec, seed, trace, reference, ending)
         name = f"episode_{episode:06d}_{recording_name(outcome)}"

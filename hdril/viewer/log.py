@@ -36,6 +36,7 @@ class EpisodeLog:
     def __init__(self, stream: rr.RecordingStream, episode: EvaluatedEpisode, player: str) -> None:
         self._stream, self._env = stream, episode.env
         self._outcome, self._trace, self._reference = episode.outcome, episode.trace, episode.reference
+        self._identity = episode.identity
         self._root = f"{player}/" if player else ""
         self._period = self._env.world.physics.control_period
         self._times = np.arange(len(self._trace.state)) * self._period
@@ -182,6 +183,10 @@ class EpisodeLog:
             f"Mean error against the expert: {outcome.position_error_cm:.2f} cm, {outcome.angle_error_rad:.3f} rad. "
             f"Inverse kinematics failed on {outcome.ik_failures} of {outcome.frames} frames."
         )
+        if not outcome.expert_success:
+            text += "\n\nThe expert itself fails on this seed: the errors against it say nothing about the policy."
+        if self._identity is not None:
+            text += f"\n\nPolicy: {self._identity.policy.summary}."
         self._log("summary", rr.TextDocument(text, media_type="text/markdown"), static=True)
 
 
@@ -206,7 +211,8 @@ def log_hands(
 def _distinct_colours(count: int) -> list[tuple[int, int, int]]:
     """Colours around the wheel, neighbours far apart; Rerun's own choice gives some neighbours the same."""
     hues = np.arange(count) * 0.618034 % 1.0
-    return [tuple(round(255 * c) for c in hsv_to_rgb(hue, 0.55, 0.8)) for hue in hues]  # pyright: ignore
+    colours = (hsv_to_rgb(hue, 0.55, 0.8) for hue in hues)
+    return [(round(255 * red), round(255 * green), round(255 * blue)) for red, green, blue in colours]
 
 
 def log_lane(

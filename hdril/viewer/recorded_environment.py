@@ -7,8 +7,9 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
-from hdril.actor import Decision
+from hdril.actor import Decision, Observation
 from hdril.env import BimanualEnv
 from hdril.evaluation.evaluate import EvaluatedEpisode
 from hdril.evaluation.reference import ReferenceCache
@@ -19,18 +20,17 @@ from hdril.viewer.keep import keeps
 from hdril.viewer.recordings import write_recording
 
 
-class RecordedEpisodes(gym.Wrapper):
+class RecordedEpisodes(gym.Wrapper[Observation, NDArray[np.floating], Observation, NDArray[np.floating]]):
     """Writes episodes as Rerun recordings, judged like those of ``hdril-eval``.
 
     Only episodes whose ``reset`` was given a seed: the expert's episode of the same seed is part of a recording.
     """
 
-    env: BimanualEnv
-
     def __init__(self, env: BimanualEnv, keep: str, folder: Path) -> None:
         super().__init__(env)
+        self._env = env
         self._keep, self._folder = keep, folder
-        self._references = ReferenceCache(BimanualEnv(env.task))
+        self._references = ReferenceCache(env.task)
         self._recorder: TraceRecorder | None = None
         self._seed, self._episode = -1, -1
 
@@ -39,7 +39,7 @@ class RecordedEpisodes(gym.Wrapper):
         self._recorder, self._observation = None, observation
         if seed is not None:
             self._recorder = TraceRecorder()
-            self._recorder.begin(self.env, observation, info)
+            self._recorder.begin(self._env, observation, info)
             self._seed, self._episode = seed, self._episode + 1
         return observation, info
 
@@ -53,7 +53,7 @@ class RecordedEpisodes(gym.Wrapper):
             )
             self._observation = observation
             if terminated or truncated:
-                self._finish(Ending(bool(info["is_success"]), str(info["unmet"]), self.env.frame))
+                self._finish(Ending(bool(info["is_success"]), str(info["unmet"]), self._env.frame))
         return result
 
     def _finish(self, ending: Ending) -> None:
@@ -62,5 +62,5 @@ class RecordedEpisodes(gym.Wrapper):
             return
         reference = self._references.get(self._seed)
         trace = recorder.trace(reference.scripted)
-        outcome = score_episode(self.env.task_spec, self._seed, trace, reference, ending)
-        write_recording(self._folder, EvaluatedEpisode(self.env, outcome, trace, reference))
+        outcome = score_episode(self._env.task_spec, self._seed, trace, reference, ending)
+        write_recording(self._folder, EvaluatedEpisode(self._env, outcome, trace, reference))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import rerun as rr
 
 from hdril.evaluation.evaluate import EvaluatedEpisode
 from hdril.evaluation.score import Outcome
+from hdril.evaluation.software import SHORT
 from hdril.viewer.blueprint import blueprint
 from hdril.viewer.keep import keeps
 from hdril.viewer.log import EpisodeLog
@@ -47,13 +49,17 @@ def write_episodes(path: Path, name: str, episodes: dict[str, EvaluatedEpisode])
     """Write one recording of several players' episodes of the same seed, side by side on one timeline.
 
     ``episodes`` are by the name of the player, with which its entities begin; a single one may have the name "". The worlds
-    of their environments must still be open.
+    of their environments must still be open. The recording's properties say what played them, as JSON.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     env = next(iter(episodes.values())).env
-    with rr.RecordingStream(APPLICATION, recording_id=f"{env.task}-{name}") as stream:
+    # The viewer takes recordings of the same id for parts of one: the same seed, played by other weights, is another one.
+    players = [episode.identity.policy.weights[:SHORT] for episode in episodes.values() if episode.identity is not None]
+    with rr.RecordingStream(APPLICATION, recording_id="-".join([env.task, name, *players])) as stream:
         stream.save(path, default_blueprint=blueprint(env, list(episodes)))
         stream.send_recording_name(name)
         for player, episode in episodes.items():
+            if episode.identity is not None:
+                stream.send_property(player or "policy", rr.AnyValues(identity=json.dumps(episode.identity.as_dict())))
             EpisodeLog(stream, episode, player).send()
     return path

@@ -1,0 +1,141 @@
+"""What an evaluation is of: weights, scenes and software, so that results are never taken for those of another."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from inspect import signature
+from typing import Any
+
+from hdril.evaluation.software import SHORT, evaluation_software
+from hdril.tasks import TASKS, base_name, get_task
+
+Values = Mapping[str, Any]
+
+
+def digest_json(value: Any) -> str:
+    """SHA-256 of canonical JSON: sorted keys, no spaces."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class PolicyIdentity:
+    """What decides a policy's actions. Where its files lie, and how they are called, is no part of it.
+
+    The device is: kernels of another one round in another way, and an episode at the edge of success may end otherwise.
+    """
+
+    type: str
+    weights: str
+    """SHA-256 of ``model.safetensors``."""
+    config: str
+    """SHA-256 of the config as it is used, overrides included, as canonical JSON; without the device, and without
+    repositories, tags and paths, which change no action."""
+    processors: str
+    """SHA-256 of the files of both processors."""
+    device: str
+    software: dict[str, str]
+
+    @property
+    def summary(self) -> str:
+        """The type of the policy and the digests that tell it apart, for people."""
+        return f"{self.type}, weights {self.weights[:SHORT]}, config {self.config[:SHORT]}"
+
+
+@dataclass(frozen=True)
+class TrialsIdentity:
+    """What a policy was tried on: the same for any two that are compared."""
+
+    task: str
+    """Its name, without parameters."""
+    parameters: dict[str, float]
+    """Of the task, with the defaults of those that were not given."""
+    first_seed: int
+    num_episodes: int
+    max_frames: int
+    """Frames after which an episode is cut."""
+    software: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Identity:
+    """All that makes the results of an evaluation, the machine aside."""
+
+    policy: PolicyIdentity
+    trials: TrialsIdentity
+
+    def as_dict(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return asdict(self)
+
+
+def identify_trials(task: str, first_seed: int, num_episodes: int, max_frames: int | None = None) -> TrialsIdentity:
+    """The trials on a task's seeds from ``first_seed`` on; ``max_frames`` is the task's horizon unless given.
+
+    Raises:
+        ValueError: there is no such task, or an episode would be cut before the task's horizon, where success is judged.
+    """
+    horizon = get_task(task).horizon
+    frames = horizon if max_frames is None else max_frames
+    if frames < horizon:
+        raise ValueError(
+            f"max_frames must be at least {horizon}, the horizon of {task}, from which on success is judged; got {frames}"
+        )
+    software = evaluation_software(base_name(task))
+    return TrialsIdentity(base_name(task), task_parameters(task), first_seed, num_episodes, frames, software)
+
+
+def task_parameters(task: str) -> dict[str, float]:
+    """The parameters of a valid task: those that its name gives, and the defaults of the others."""
+    base, _, settings = task.partition(":")
+    build = getattr(TASKS.source(base), "make_task", None)
+    defaults = {name: float(entry.default) for name, entry in signature(build).parameters.items()} if build else {}
+    given = dict(setting.split("=") for setting in settings.split(",")) if settings else {}
+    return defaults | {name: float(value) for name, value in given.items()}
+
+
+def _leaves(values: Values, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, path if name in ("policy", "trials", "software") else (*path, name))
+        else:
+            yield " ".join((*path, name)).replace("_", " "), value
+
+
+def _shown(value: Any) -> str:
+    text = str(value)
+    return text[:SHORT] if len(text) == 64 and " " not in text else text
+
+
+def differences(there: Values, here: Values) -> list[str]:
+    """What differs between two identities, or the same part of two, as JSON has them: "weights (3f2a… there, 9c1b… here)".
+
+    ``there`` is what was stored, ``here`` what is asked for now. An identity that is empty differs in everything.
+    """
+    stored, wanted = dict(_leaves(there)), dict(_leaves(here))
+    names = [*wanted, *(name for name in stored if name not in wanted)]
+    return [
+        f"{name} ({_shown(stored.get(name, 'none'))} there, {_shown(wanted.get(name, 'none'))} here)"
+        for name in names
+        if stored.get(name) != wanted.get(name)
+    ]
+
+
+def require_same(what: str, there: Values | None, here: Values, remedy: str) -> None:
+    """Refuse results that something else made.
+
+    Args:
+        what: names the stored results, as the subject of a sentence.
+        there: their identity, or a part of it; None or empty if they have none.
+        here: the same part of the identity that is asked for.
+        remedy: what to do instead.
+
+    Raises:
+        ValueError: they differ; names in what.
+    """
+    if not there:
+        raise ValueError(f"{what} has no record of what made its results (an older hdril wrote it); {remedy}")
+    if found := differences(there, here):
+        raise ValueError(f"{what} holds results of other {', '.join(found)}; {remedy}")
