@@ -8,11 +8,14 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 # Several test processes share two cores.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from filelock import FileLock
 
+from hdril.demonstrations.episode import Episode
 from hdril.demonstrations.provenance import Recipe
 from hdril.demonstrations.record import record
 
@@ -30,3 +33,23 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
         if not root.exists():
             record(Recipe("table_lift"), 6, 0, root)
     return root
+
+
+@pytest.fixture(scope="session")
+def made_up() -> Callable[..., Episode]:
+    """``made_up(seed, frames=12, success=True)``: an episode of table lift whose numbers depend on the seed alone."""
+
+    def make(seed: int, frames: int = 12, success: bool = True, label: list[int] | None = None) -> Episode:
+        rng = np.random.default_rng(seed)
+        return Episode(
+            seed=seed,
+            state=rng.normal(size=(frames, 16)).astype(np.float32),
+            environment_state=rng.normal(size=(frames, 7)).astype(np.float32),
+            action=rng.normal(size=(frames, 16)).astype(np.float32),
+            label=np.array(label) if label else np.arange(frames) * 6 // frames,
+            reward=rng.uniform(size=frames).astype(np.float32),
+            success=success,
+            unmet="" if success else "table upright",
+        )
+
+    return make

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import fields
+from itertools import pairwise
 from typing import Any
 
 import draccus
@@ -43,10 +44,9 @@ def _with_underscores(argument: str) -> str:
 def _switches(arguments: list[str], config_class: type[Any]) -> list[str]:
     """``--web`` as ``--web=true``, for options that are yes or no."""
     names = {f"--{entry.name}" for entry in fields(config_class) if entry.type in (bool, "bool")}
-    following = [*arguments[1:], "--"]
     return [
         f"{argument}=true" if argument in names and after.startswith("--") else argument
-        for argument, after in zip(arguments, following, strict=True)
+        for argument, after in pairwise([*arguments, "--"])
     ]
 
 
@@ -64,14 +64,15 @@ def run(program: str, config_class: type[Any], command: Callable[[Any], None]) -
         print(f"\n{program}: interrupted", file=sys.stderr)
         sys.exit(130)
     except (*EXPECTED, draccus.utils.DraccusException) as error:
-        if os.environ.get("HDRIL_DEBUG"):
+        reason = _reason(error)
+        if os.environ.get("HDRIL_DEBUG") or not isinstance(reason, (*EXPECTED, draccus.utils.DraccusException)):
             raise
-        print(f"{program}: error: {_message(error)}", file=sys.stderr)
+        print(f"{program}: error: {' '.join(str(reason).split())}", file=sys.stderr)
         sys.exit(2)
 
 
-def _message(error: BaseException) -> str:
-    """What went wrong, on one line. draccus wraps the reason that a config class gives; the reason is what helps."""
-    if isinstance(error, draccus.utils.DraccusException) and isinstance(error.__cause__, EXPECTED):
-        return _message(error.__cause__)
-    return " ".join(str(error).split())
+def _reason(error: BaseException) -> BaseException:
+    """What helps: draccus names the option whose value it cannot read, but wraps what a config class says of its values."""
+    if isinstance(error, draccus.utils.DecodingError) or not isinstance(error, draccus.utils.DraccusException):
+        return error
+    return error.__cause__ or error
