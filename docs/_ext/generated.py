@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from importlib import import_module
@@ -48,8 +49,18 @@ class ModuleText(SphinxDirective):
         return self.parse_text_to_nodes(module.__doc__ or "")
 
 
+def escape_bars(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Norms in equations, |x|, are no substitutions of reStructuredText: escape bars that are not in literals."""
+    for number, line in enumerate(lines):
+        parts = line.split("``")
+        parts[::2] = [re.sub(r"(?<!\\)\|", r"\\|", part) for part in parts[::2]]
+        lines[number] = "``".join(parts)
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Called by Sphinx."""
     app.add_directive("command-help", CommandHelp)
     app.add_directive("module-text", ModuleText)
+    # After napoleon, which makes fields of sections.
+    app.connect("autodoc-process-docstring", escape_bars, priority=900)
     return {"parallel_read_safe": True}

@@ -33,8 +33,10 @@ key                                  meaning
                                      task's labels
 ``comparison``                       against another policy on the same seeds; null if there is none
 ``comparison.against``               the other policy
-``comparison.both``, ``first_only``, seeds on which both succeeded, this policy alone, the other alone, and neither
-``second_only``, ``neither``
+``comparison.both``                  seeds on which both policies succeeded
+``comparison.first_only``            seeds on which this policy alone succeeded
+``comparison.second_only``           seeds on which the other policy alone succeeded
+``comparison.neither``               seeds on which neither succeeded
 ``comparison.pc_difference``         success rate of this policy minus the other's, percentage points
 ``comparison.pc_difference_ci95``    its 95 % interval (Newcombe's method 10), percentage points
 ``comparison.p_value``               McNemar's exact test, two-sided

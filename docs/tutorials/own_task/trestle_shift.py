@@ -11,18 +11,18 @@ from hdril.tasks.conditions import Measure, Stage, at_height, at_rest, lies_at, 
 from hdril.tasks.primitives import Grip, extend, grasp, lift, place, retract
 from hdril.tasks.task import Task, Uniform
 
-HEIGHT, HANDLE_Y = 0.30, 0.39
+HEIGHT, HANDLE_Y = 0.30, 0.41
 
 # Boxes of one density, in the body's frame: x forward, y left, z up, the origin at the foot. A handle is 2.5 cm thick in y,
 # which the jaws close on; the beam is thicker than they open.
 TRESTLE = BodySpec(
     "trestle",
     (
-        Box((0.12, 0.81, 0.06), (0.0, 0.0, HEIGHT - 0.03)),
+        Box((0.12, 0.85, 0.06), (0.0, 0.0, HEIGHT - 0.03)),
         *(Box((0.30, 0.04, HEIGHT - 0.06), (0.0, y, (HEIGHT - 0.06) / 2)) for y in (-0.30, 0.30)),
         *(Box((0.08, 0.025, 0.09), (0.0, y, HEIGHT + 0.045)) for y in (-HANDLE_Y, HANDLE_Y)),
     ),
-    mass=1.5,
+    mass=2.5,
 )
 
 # A grip is a pose of the tool in the body's frame: z is the direction in which the hand approaches, here forward and down.

@@ -1,0 +1,125 @@
+"""What the pages say: length, links, commands and tables, against the repository as it is."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import pytest
+import yaml
+
+import hdril
+from hdril.cli.bench import BenchConfig
+from hdril.cli.eval import EvalConfig
+from hdril.cli.record import RecordConfig
+from hdril.cli.view import ViewConfig
+from hdril.demonstrations.provenance import Recipe
+from hdril.demonstrations.schema import features
+from hdril.simulation.actions import ACTION_NAMES
+
+ROOT = Path(__file__).parents[2]
+TRACKED = subprocess.run(
+    ["git", "ls-files", "*.md"], cwd=ROOT, capture_output=True, text=True, check=True
+).stdout.split()
+PAGES = [ROOT / page for page in TRACKED if (ROOT / page).exists()]
+COMMANDS = {
+    "hdril-record": RecordConfig,
+    "hdril-eval": EvalConfig,
+    "hdril-view": ViewConfig,
+    "hdril-bench": BenchConfig,
+}
+each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+
+
+def test_the_readme_has_at_most_500_words_and_the_two_commands() -> None:
+    text = (ROOT / "README.md").read_text()
+    assert len(text.split()) <= 500
+    assert "make demo\nmake test\n" in text
+
+
+@each_page
+def test_links_lead_somewhere(page: Path) -> None:
+    targets = re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text())
+    local = [target for target in targets if not target.startswith(("http:", "https:", "mailto:"))]
+    assert [target for target in local if not (page.parent / target).exists()] == []
+
+
+def _command_lines(text: str) -> Iterator[list[str]]:
+    """Commands of hdril in code blocks, cut at spaces."""
+    for block in re.findall(r"^```\w*\n(.*?)^```", text, re.DOTALL | re.MULTILINE):
+        for line in block.replace("\\\n", " ").splitlines():
+            words = line.split("#")[0].split()
+            if words and words[0] in COMMANDS:
+                yield words
+
+
+@cache
+def _options(config: type[Any]) -> set[str]:
+    """Names of the options of a command, those of nested configs with a dot."""
+    hints = get_type_hints(config)
+    nested = {
+        f"{f.name}.{name}" for f in fields(config) if is_dataclass(hints[f.name]) for name in _options(hints[f.name])
+    }
+    return {field.name for field in fields(config)} | nested | {"config_path", "help"}
+
+
+@each_page
+def test_commands_have_the_options_that_the_page_gives_them(page: Path) -> None:
+    for program, *words in _command_lines(page.read_text()):
+        given = {word.removeprefix("--").split("=")[0] for word in words if word.startswith("--")}
+        of_the_policy = {name for name in given if program == "hdril-eval" and name.startswith("policy.")}
+        assert given - of_the_policy <= _options(COMMANDS[program]), f"{page.name}: {program} {' '.join(words)}"
+
+
+def test_commands_are_found_in_pages() -> None:
+    found = {words[0] for page in PAGES for words in _command_lines(page.read_text())}
+    assert {"hdril-record", "hdril-eval", "hdril-view"} <= found
+
+
+@each_page
+def test_files_that_the_page_names_exist(page: Path) -> None:
+    named = set(re.findall(r"\b(?:configs|scripts|hdril|tests)/[\w/]+\.(?:yaml|py)\b", page.read_text()))
+    if page.name == "CHANGELOG.md":  # it also names what is gone
+        return
+    assert {name for name in named if not (ROOT / name).exists()} == set()
+
+
+@pytest.mark.parametrize("task", ["table_lift", "peg_in_hole"])
+def test_the_page_of_the_dataset_has_every_column(task: str) -> None:
+    text = (ROOT / "docs/reference/dataset.md").read_text()
+    for name, feature in features(Recipe(task)).items():
+        size = "7 for each object" if name == "observation.environment_state" else feature["shape"][0]
+        assert f"| `{name}` | {feature['dtype']}, {size} |" in text, name
+    for name in ACTION_NAMES[:8]:
+        assert re.search(rf"\b{re.escape(name)}\b", text), name
+
+
+def test_the_citation_is_valid_and_of_this_version() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    # The keys that version 1.2.0 of the format requires, and their types.
+    assert citation["cff-version"] == "1.2.0"
+    assert citation["message"]
+    assert citation["title"].startswith("hdril")
+    assert citation["type"] == "software"
+    assert citation["version"] == hdril.__version__
+    assert citation["license"] == "Apache-2.0"
+    assert all("name" in author or "family-names" in author for author in citation["authors"])
+    paper = citation["references"][0]
+    assert paper["type"] == "conference-paper"
+    assert paper["title"] == "Deep Imitation Learning for Bimanual Robotic Manipulation"
+    assert [author["family-names"] for author in paper["authors"]][::5] == ["Xie", "Yu"]
+
+
+@pytest.mark.long
+def test_the_documentation_builds_without_warnings(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", ROOT / "docs", tmp_path]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "--num_episodes" in (tmp_path / "reference/commands.html").read_text()
+    assert "run_episode" in (tmp_path / "reference/api/hdril/hdril.rollout.html").read_text()
