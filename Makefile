@@ -9,7 +9,7 @@ READY := $(VENV)/.ready
 DEMO := outputs/demo
 export HF_HUB_OFFLINE ?= 1
 
-.PHONY: help setup demo test test-long bench docs wheels lint types lock clean
+.PHONY: help setup demo test test-long test-portable portability bench docs wheels lint types lock clean
 
 help: ## What there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -37,6 +37,12 @@ test: $(READY) ## The tests
 test-long: $(READY) ## The tests that take longer
 	$(BIN)/python -m pytest -n 2 --dist=loadfile -m long
 
+test-portable: $(READY) ## The tests that involve a policy, with other instruction sets and numbers of threads
+	$(BIN)/python scripts/portability.py -- $(BIN)/python -m pytest -n 2 --dist=loadfile -m "portable and not long"
+
+portability: $(READY) ## What is the same, bit for bit, with other instruction sets and numbers of threads
+	$(BIN)/python scripts/portability.py
+
 bench: $(READY) ## Speeds, as ratios within one run
 	$(BIN)/hdril-bench
 
@@ -51,7 +57,7 @@ wheels: $(READY) ## Both distributions, in outputs/wheels
 lint: $(READY) ## Formatting and lint
 	$(BIN)/ruff format --check . && $(BIN)/ruff check .
 
-types: $(READY) ## Types (pyright fetches Node where there is none)
+types: $(READY) ## Types
 	$(BIN)/pyright
 
 lock: $(READY) ## Pin the environment anew

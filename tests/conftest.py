@@ -19,6 +19,31 @@ from hdril.demonstrations.episode import Episode
 from hdril.demonstrations.provenance import Recipe
 from hdril.demonstrations.record import record
 
+POLICY_FOLDERS = {"policies", "viewer"}
+"""Folders whose tests involve a policy."""
+POLICY_FIXTURES = {"checkpoint", "runs"}
+"""Fixtures that make a policy."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line(
+        "markers", "portable: involves a policy, so it must hold on any processor; run with make test-portable"
+    )
+
+
+def pytest_report_header() -> str:
+    names = ("ATEN_CPU_CAPABILITY", "OMP_NUM_THREADS")
+    return ", ".join(f"{name}: {os.environ.get(name, 'unset')}" for name in names)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark as portable what involves a policy; other tests carry the mark themselves."""
+    for item in items:
+        fixtures = set(getattr(item, "fixturenames", ()))
+        if item.path.parent.name in POLICY_FOLDERS or fixtures & POLICY_FIXTURES:
+            item.add_marker(pytest.mark.portable)
+
 
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
