@@ -3,46 +3,46 @@
 Rates are in percent, as in LeRobot's ``eval_info.json``. ``null`` stands for what does not apply or is not known. A *spread*
 is ``{"mean": …, "std": …}`` over episodes; the standard deviation has n in its denominator.
 
-===================================  =================================================================================
-key                                  meaning
-===================================  =================================================================================
-``task``                             the task with its parameters, as given
-``policy``                           the checkpoint, as given; for display
-``overrides``                        options of the policy's config that were given, ``--name=value``
-``first_seed``, ``num_episodes``     the seeds are ``first_seed``, ``first_seed + 1``, …; one episode each
-``held_out``                         whether the seeds were checked to be apart from the training data; null: cannot be told
-``held_out_basis``                   what it was checked against, or why it cannot be told
-``max_frames``                       frames after which an episode was cut; 0: the task's horizon
-``notes``                            sentences that a reader of the results must know
-``identity``                         what made the results, see :class:`hdril.evaluation.identity.Identity`
-``n_episodes``, ``n_success``        episodes played, and those that succeeded
-``pc_success``                       success rate, %
-``pc_success_ci95``                  its 95 % interval (Wilson), %: ``[low, high]``
-``n_expert_failures``                seeds on which the expert itself fails; the errors below leave them out
-``position_error_cm``                spread of :attr:`Outcome.position_error_cm`, cm; null if the expert solves no seed
-``angle_error_rad``                  spread of :attr:`Outcome.angle_error_rad`, rad; null likewise
-``dtw_cm``                           spread of :attr:`Outcome.dtw_cm`, cm; null likewise
-``position_error_cm_by_primitive``   spread by name of the expert's primitive, cm; without primitives that were not reached
-``stages_reached``                   episodes by the last stage reached: a stage, ``none`` or ``success``
-``pc_expert_order``                  episodes in which the policy played the expert's order of primitives, % of those with
-                                     primitives; null for a policy without
-``planner``                          null for a policy without a planner, or with primitives that are not the task's
-``planner.pc_correct``               frames at which it prefers the expert's primitive, %
-``planner.pc_correct_at_boundaries`` the same of the first frames of primitives alone, %
-``planner.confusion``                frames by the expert's primitive (row) and the preferred one (column), in the order of the
-                                     task's labels
-``comparison``                       against another policy on the same seeds; null if there is none
-``comparison.against``               the other policy
-``comparison.both``                  seeds on which both policies succeeded
-``comparison.first_only``            seeds on which this policy alone succeeded
-``comparison.second_only``           seeds on which the other policy alone succeeded
-``comparison.neither``               seeds on which neither succeeded
-``comparison.pc_difference``         success rate of this policy minus the other's, percentage points
-``comparison.pc_difference_ci95``    its 95 % interval (Newcombe's method 10), percentage points
-``comparison.p_value``               McNemar's exact test, two-sided
-``hdril_version``                    version of hdril
-``per_episode``                      an object for each seed with the fields of :class:`hdril.evaluation.score.Outcome`
-===================================  =================================================================================
+====================================  =================================================================================
+key                                   meaning
+====================================  =================================================================================
+``task``                              the task with its parameters, as given
+``policy``                            the checkpoint, as given; for display
+``overrides``                         options of the policy's config that were given, ``--name=value``
+``first_seed``, ``num_episodes``      the seeds are ``first_seed``, ``first_seed + 1``, …; one episode each
+``held_out``                          whether the seeds were checked to be apart from the training data; null: cannot be told
+``held_out_basis``                    what it was checked against, or why it cannot be told
+``max_frames``                        frames after which an episode was cut; 0: the task's horizon
+``notes``                             sentences that a reader of the results must know
+``identity``                          what made the results, see :class:`hdril.evaluation.identity.Identity`
+``n_episodes``, ``n_success``         episodes played, and those that succeeded
+``pc_success``                        success rate, %
+``pc_success_ci95``                   its 95 % interval (Wilson), %: ``[low, high]``
+``n_expert_failures``                 seeds on which the expert itself fails; the errors below leave them out
+``position_error_cm``                 spread of :attr:`Outcome.position_error_cm`, cm; null if the expert solves no seed
+``angle_error_rad``                   spread of :attr:`Outcome.angle_error_rad`, rad; null likewise
+``dtw_cm``                            spread of :attr:`Outcome.dtw_cm`, cm; null likewise
+``position_error_cm_by_primitive``    spread by name of the expert's primitive, cm; without primitives that were not reached
+``stages_reached``                    episodes by the last stage reached: a stage, ``none`` or ``success``
+``pc_expert_order``                   episodes in which the policy played the expert's order of primitives, % of those with
+                                      primitives; null for a policy without
+``planner``                           null for a policy without a planner, or with primitives that are not the task's
+``planner.pc_correct``                frames at which it prefers the expert's primitive, %
+``planner.pc_correct_at_boundaries``  the same of the first frames of primitives alone, %
+``planner.confusion``                 frames by the expert's primitive (row) and the preferred one (column), in the order of the
+                                      task's labels
+``comparison``                        against another policy on the same seeds; null if there is none
+``comparison.against``                the other policy
+``comparison.both``                   seeds on which both policies succeeded
+``comparison.first_only``             seeds on which this policy alone succeeded
+``comparison.second_only``            seeds on which the other policy alone succeeded
+``comparison.neither``                seeds on which neither succeeded
+``comparison.pc_difference``          success rate of this policy minus the other's, percentage points
+``comparison.pc_difference_ci95``     its 95 % interval (Newcombe's method 10), percentage points
+``comparison.p_value``                McNemar's exact test, two-sided
+``hdril_version``                     version of hdril
+``per_episode``                       an object for each seed with the fields of :class:`hdril.evaluation.score.Outcome`
+====================================  =================================================================================
 """
 
 from __future__ import annotations

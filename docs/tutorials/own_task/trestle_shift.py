@@ -1,4 +1,4 @@
-"""Trestle shift: two hands lift a trestle by its ends, and set it down in the middle of the bench."""
+"""Trestle shift: two hands lift a trestle by its ends, and set it down on a step."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -7,11 +7,11 @@ from hdril.geometry import Pose
 from hdril.simulation.bodies import BodySpec, Box
 from hdril.simulation.world import ROBOT
 from hdril.tasks.bench import BENCH, BENCH_PLACEMENT
-from hdril.tasks.conditions import Measure, Stage, at_height, at_rest, lies_at, not_touching, raised, upright
+from hdril.tasks.conditions import Measure, Stage, at_height, at_rest, not_touching, raised, touching, upright
 from hdril.tasks.primitives import Grip, extend, grasp, lift, place, retract
-from hdril.tasks.task import Task, Uniform
+from hdril.tasks.task import Task, Uniform, fixed
 
-HEIGHT, HANDLE_Y = 0.30, 0.41
+HEIGHT, HANDLE_Y, STEP_X = 0.30, 0.41, 0.90
 
 # Boxes of one density, in the body's frame: x forward, y left, z up, the origin at the foot. A handle is 2.5 cm thick in y,
 # which the jaws close on; the beam is thicker than they open.
@@ -19,10 +19,10 @@ TRESTLE = BodySpec(
     "trestle",
     (
         Box((0.12, 0.85, 0.06), (0.0, 0.0, HEIGHT - 0.03)),
-        *(Box((0.30, 0.04, HEIGHT - 0.06), (0.0, y, (HEIGHT - 0.06) / 2)) for y in (-0.30, 0.30)),
+        *(Box((0.20, 0.04, HEIGHT - 0.06), (0.0, y, (HEIGHT - 0.06) / 2)) for y in (-0.30, 0.30)),
         *(Box((0.08, 0.025, 0.09), (0.0, y, HEIGHT + 0.045)) for y in (-HANDLE_Y, HANDLE_Y)),
     ),
-    mass=2.5,
+    mass=2.0,
 )
 
 # A grip is a pose of the tool in the body's frame: z is the direction in which the hand approaches, here forward and down.
@@ -33,27 +33,37 @@ GRIPS = {
 }
 
 
-def make_task(x: float = 0.75) -> Task:
-    """The task; ``x``, m, is where the trestle is to stand: ``--task=trestle_shift:x=0.8``.
+def make_task(height: float = 0.08) -> Task:
+    """The task; ``height``, m, is that of the step: ``--task=trestle_shift:height=0.1``.
 
     Raises:
-        ValueError: the place is out of reach.
+        ValueError: the step is too low to need two hands, or too high to reach.
     """
-    if not 0.65 <= x <= 0.85:
-        raise ValueError(f"x must be from 0.65 to 0.85 m, got {x}")
+    if not 0.05 <= height <= 0.12:
+        raise ValueError(f"height must be from 0.05 to 0.12 m, got {height}")
+    step = BodySpec("step", (Box((0.30, 0.90, height), (0.0, 0.0, height / 2)),))
     return Task(
         name="trestle_shift",
-        description="Lift the trestle with both hands and set it down in the middle of the bench.",
-        bodies=(BENCH, TRESTLE),
-        placements={BENCH.name: BENCH_PLACEMENT, "trestle": Uniform((0.52, -0.20, 0.0), (0.66, 0.20, 0.0))},
+        description="Lift the trestle with both hands and set it down on the step.",
+        bodies=(BENCH, TRESTLE, step),
+        placements={
+            BENCH.name: BENCH_PLACEMENT,
+            "trestle": Uniform((0.50, -0.20, 0.0), (0.60, 0.20, 0.0)),
+            "step": fixed((STEP_X, 0.0, 0.0)),
+        },
         observed=("trestle",),
-        primitives=(grasp(GRIPS), lift("trestle", 0.08), extend("trestle", x, 0.0), place("trestle", 0.0), retract()),
+        primitives=(
+            grasp(GRIPS),
+            lift("trestle", height + 0.06),
+            extend("trestle", STEP_X, 0.0),
+            place("trestle", height),
+            retract(),
+        ),
         success=(
             upright("trestle"),
-            at_height("trestle", 0.0),
+            at_height("trestle", height),
             at_rest("trestle"),
-            lies_at("trestle", "x", x, tolerance=0.02),
-            lies_at("trestle", "y", 0.0, tolerance=0.02),
+            touching("trestle", "step"),
             not_touching("trestle", ROBOT),
         ),
         stages=(Stage("lifted", (raised("trestle", 0.05),)),),
