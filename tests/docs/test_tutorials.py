@@ -43,7 +43,7 @@ def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_task_from_another_package_is_recorded(package: Path, tmp_path: Path) -> None:
-    command = [Path(sys.executable).with_name("hdril-record"), "--task=trestle_shift:height=0.1", "--root=data",
+    command = [Path(sys.executable).with_name("hdril-record"), "--task=trestle_shift:height=0.14", "--root=data",
                "--num_episodes=3", "--workers=1"]  # fmt: skip
     printed = _run(command, tmp_path, PYTHONPATH=str(package))
     assert "0 of 3 dropped" in printed
@@ -53,7 +53,7 @@ def test_a_task_from_another_package_is_recorded(package: Path, tmp_path: Path) 
     # The parameter acts: the trestle ends at the height of the step.
     for _, episode in data.groupby("episode_index"):
         _, _, z, *_ = episode["observation.environment_state"].iloc[-1]
-        assert abs(z - 0.1) < 0.01
+        assert abs(z - 0.14) < 0.01
 
 
 def test_gymnasium_knows_the_task(package: Path, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ TRESTLE = BodySpec(
         *(Box((0.20, 0.04, HEIGHT - 0.06), (0.0, y, (HEIGHT - 0.06) / 2)) for y in (-0.30, 0.30)),
         *(Box((0.08, 0.025, 0.09), (0.0, y, HEIGHT + 0.045)) for y in (-HANDLE_Y, HANDLE_Y)),
     ),
-    mass=2.0,
+    mass=2.5,
 )
 
 # A grip is a pose of the tool in the body's frame: z is the direction in which the hand approaches, here forward and down.
@@ -33,14 +33,14 @@ GRIPS = {
 }
 
 
-def make_task(height: float = 0.08) -> Task:
-    """The task; ``height``, m, is that of the step: ``--task=trestle_shift:height=0.1``.
+def make_task(height: float = 0.12) -> Task:
+    """The task; ``height``, m, is that of the step: ``--task=trestle_shift:height=0.14``.
 
     Raises:
         ValueError: the step is too low to need two hands, or too high to reach.
     """
-    if not 0.05 <= height <= 0.12:
-        raise ValueError(f"height must be from 0.05 to 0.12 m, got {height}")
+    if not 0.10 <= height <= 0.14:
+        raise ValueError(f"height must be from 0.10 to 0.14 m, got {height}")
     step = BodySpec("step", (Box((0.30, 0.90, height), (0.0, 0.0, height / 2)),))
     return Task(
         name="trestle_shift",
