@@ -1,7 +1,7 @@
 """Table lift from nothing to an evaluated policy: what ``make demo`` runs.
 
-Each stage is one command that a user could type; it is printed before it runs. A stage whose result is there already is
-skipped, so an interrupted demo goes on where it was.
+Each stage is one command that a user could type; it is printed before it runs. A stage whose result is there is skipped, so
+an interrupted demo continues where it stopped.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from stages import Stage, record_stage, train_stage
+from stages import Stage, record_stage, train_stage, weights
 
 
 def stages(output: Path, episodes: int, steps: int, evaluations: int) -> list[Stage]:
@@ -27,13 +27,18 @@ def stages(output: Path, episodes: int, steps: int, evaluations: int) -> list[St
             ("lerobot-eval", f"--policy.path={policy}", "--env.type=hdril", "--env.task=table_lift",
              "--eval.n_episodes=10", "--eval.batch_size=2", "--eval.use_async_envs=true", "--seed=200000",
              f"--output_dir={output / 'lerobot-eval'}"),
+            output / "lerobot-eval",
             output / "lerobot-eval" / "eval_info.json",
+            weights(policy),
+            resumes=False,
         ),
         Stage(
             f"evaluation on {evaluations} held-out seeds, with a report and recordings",
             ("hdril-eval", f"--policy.path={policy}", "--task=table_lift", f"--num_episodes={evaluations}",
              "--rerun=2", f"--output_dir={output / 'eval'}"),
+            output / "eval",
             output / "eval" / "results.json",
+            weights(policy),
         ),
     ]  # fmt: skip
 
@@ -54,7 +59,7 @@ def main() -> None:
                 f"demo: {stage.command[0]} failed with exit code {error.returncode}; run the command above to see why"
             )
         except KeyboardInterrupt:
-            sys.exit("\ndemo: interrupted; run it again to go on")
+            sys.exit("\ndemo: interrupted; run it again to continue")
     results = json.loads((options.output / "eval" / "results.json").read_text())
     low, high = results["pc_success_ci95"]
     print(f"\n== Table lift: {results['n_success']} of {results['n_episodes']} held-out seeds, "

@@ -1,11 +1,12 @@
-"""How long, from how much, and with which latent HDR-IL learns a task.
+"""How long HDR-IL trains, from how many demonstrations it learns, and with which latent.
 
-python scripts/learning.py     trains and evaluates what is missing, then writes docs/learning.md, .json and .png
+python scripts/learning.py                  trains and evaluates what is missing, then writes docs/learning.md, .json and .png
+python scripts/learning.py --report-only    writes the .md and .png again from the .json
 
 Four questions, each with stock ``lerobot-train`` and held-out seeds: success after so many minutes of training; success of
 the last checkpoint on many seeds; success from few demonstrations, on disjoint choices of them; and the latent
-(deterministic, variational, sampled), on seeds of its own, because its answer chooses a default.
-What is done is skipped: after Ctrl-C the same command goes on.
+(deterministic, variational, sampled), on seeds that nothing else uses, because the answer chooses a default.
+What is done is skipped: after Ctrl-C the same command continues.
 """
 
 from __future__ import annotations
@@ -17,15 +18,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
+from learning_report import draw, markdown
 from stages import Stage, checkpoint, commit, evaluation_stage, record_stage, run_chains, train_stage
 
-from hdril.evaluation.statistics import wilson_interval
-
+SETTINGS_LEFT_OUT = ("output", "document", "jobs", "report_only")
 CURVE_STRIDE = 100
 CURVE_STEPS = (100, 200, 300, 500, 700, 1000, 1500, 2000, 2500)
 
-# Options of training and of evaluation. What is evaluated twice is trained once.
+# Options of training and of evaluation. Two latents with the same options of training are trained once.
 LATENTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "deterministic": (("--policy.latent=deterministic",), ()),
     "variational, KL weight 0, mean": (("--policy.latent=variational",), ()),
@@ -43,8 +43,8 @@ def subset(size: int, number: int) -> str:
     return f"--dataset.episodes={list(range(number * size, (number + 1) * size))}"
 
 
-class Report:
-    """Where everything of a run lies, the stages that make it, and what they found."""
+class Study:
+    """The folders of a run, the stages that fill them, and what they found."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         self.options = options
@@ -55,7 +55,7 @@ class Report:
         self.steps = sorted({step for step in CURVE_STEPS if step < options.steps} | {options.steps})
 
     def train_curve(self) -> None:
-        """Train with all demonstrations, nothing of ours beside it, and remember when it began."""
+        """Train with all demonstrations while nothing else runs, and remember when it began."""
         stage = train_stage("all demonstrations", self.config, self.dataset, self.curve / "train",
                             self.options.steps, save_every=CURVE_STRIDE)  # fmt: skip
         if not stage.result.exists():
@@ -91,7 +91,7 @@ class Report:
             [self._evaluate(f"after {step} steps", checkpoint(self.curve / "train", step), self.curve / f"{step}")]
             for step in self.steps
         ]
-        trained: dict[Path, list[Stage]] = {}  # what needs a training follows it in its chain
+        trained: dict[Path, list[Stage]] = {}  # a chain: a training, then the evaluations of its policy
         for size in options.few:
             for number in range(options.choices):
                 train, folder = self.few_train(size, number), self.few(size, number)
@@ -139,7 +139,7 @@ class Report:
             }
             for name in LATENTS
         }
-        settings = {key: value for key, value in vars(options).items() if key not in ("output", "document", "jobs")}
+        settings = {key: value for key, value in vars(options).items() if key not in SETTINGS_LEFT_OUT}
         return settings | {
             "commit": commit(),
             "cores": json.loads(self.started.read_text())["cores"],
@@ -153,6 +153,7 @@ class Report:
 
 
 def _summary(folder: Path) -> dict[str, Any]:
+    """What the report needs of an evaluation. ``failed_seeds`` lets it pair two evaluations seed by seed."""
     summary = json.loads((folder / "results.json").read_text())
     keys = (
         "first_seed",
@@ -163,99 +164,17 @@ def _summary(folder: Path) -> dict[str, Any]:
         "position_error_cm",
         "stages_reached",
     )
-    return {key: summary[key] for key in keys} | {"planner_pc_correct": summary["planner"]["pc_correct"]}
+    return {key: summary[key] for key in keys} | {
+        "failed_seeds": [episode["seed"] for episode in summary["per_episode"] if not episode["success"]],
+        "planner_pc_correct": summary["planner"]["pc_correct"],
+    }
 
 
-def _row(cells: list[Any]) -> str:
-    return "| " + " | ".join(map(str, cells)) + " |"
-
-
-def _table(header: list[str], rows: list[list[Any]]) -> list[str]:
-    return [_row(header), "|" + "---|" * len(header), *map(_row, rows), ""]
-
-
-def _rate(summaries: list[dict[str, Any]]) -> str:
-    """Success of all episodes together: "n of m (low to high %)"."""
-    successes, trials = (sum(summary[key] for summary in summaries) for key in ("n_success", "n_episodes"))
-    low, high = wilson_interval(successes, trials)
-    return f"{successes} of {trials} ({100 * low:.1f} to {100 * high:.1f} %)"
-
-
-def _error(summaries: list[dict[str, Any]]) -> str:
-    mean = sum(summary["position_error_cm"]["mean"] for summary in summaries) / len(summaries)
-    return f"{mean:.2f}"
-
-
-def markdown(found: dict[str, Any], picture: str) -> str:
-    """The report."""
-    reached = next(
-        (point for i, point in enumerate(found["curve"]) if all(p["pc_success"] >= 99.0 for p in found["curve"][i:])),
-        None,
-    )
-    until = f"99 % is reached after {reached['minutes']:.1f} minutes, and kept" if reached else "99 % is not reached"
-    small = found["few"][0]
-    return "\n".join(
-        [
-            f"# How HDR-IL learns {found['task']}",
-            "",
-            f"Made by `python scripts/learning.py` on commit {found['commit']}, on {found['cores']} cores and no GPU. Closed "
-            "loop, planner included, held-out seeds, 95 % intervals; the position error is the distance of the hands from the "
-            "expert's on the same seed, mean over episodes.",
-            "",
-            "## Minutes",
-            "",
-            f"`OMP_NUM_THREADS=1 lerobot-train --config_path=configs/train/{found['task']}.yaml` on {found['demonstrations']} "
-            f"demonstrations; minutes from the start of the command, imports included, to the checkpoint. The linear "
-            f"maps are solved before the first step: the first steps train the planner, and the rest what the maps leave. "
-            f"Seeds from {found['seed']} on. {until}.",
-            "",
-            f"![Success over minutes of training]({picture})",
-            "",
-            *_table(
-                ["steps", "minutes", "success", "position error, cm", "planner right, % of frames"],
-                [[point["steps"], f"{point['minutes']:.1f}", _rate([point]), _error([point]),
-                  f"{point['planner_pc_correct']:.1f}"] for point in found["curve"]],
-            ),
-            f"The last checkpoint on seeds from {found['held_out_seed']} on: **{_rate([found['final']])}**, "
-            f"{_error([found['final']])} cm.",
-            "",
-            "## Demonstrations",
-            "",
-            f"{found['few_steps']:,} steps on disjoint choices of the demonstrations (`--dataset.episodes`); the same seeds.",
-            "",
-            *_table(
-                ["demonstrations", *(f"choice {i}" for i in range(found["choices"])), "together", "position error, cm"],
-                [[size, *(_rate([one]) for one in runs), _rate(runs), _error(runs)]
-                 for size, runs in found["few_shot"].items()],
-            ),
-            "## The latent",
-            "",
-            f"With all demonstrations ({found['steps']:,} steps) and with {small} ({found['few_steps']:,} steps, "
-            f"{found['choices']} choices), on seeds from {found['latent_seed']} on, which nothing else here uses.",
-            "",
-            *_table(
-                ["latent", "all: success", "position error, cm", f"{small}: success", "position error, cm"],
-                [[name, _rate([runs["all"]]), _error([runs["all"]]), _rate(runs["few"]), _error(runs["few"])]
-                 for name, runs in found["latent"].items()],
-            ),
-        ]
-    )  # fmt: skip
-
-
-def draw(found: dict[str, Any], path: Path) -> None:
-    """Success with its interval, and the position error, over minutes."""
-    curve = found["curve"]
-    minutes = [point["minutes"] for point in curve]
-    figure, (success, error) = plt.subplots(1, 2, figsize=(9, 3), constrained_layout=True)
-    lowest = min(point["pc_success_ci95"][0] for point in curve)
-    success.fill_between(minutes, *zip(*(point["pc_success_ci95"] for point in curve), strict=True), alpha=0.25)
-    success.plot(minutes, [point["pc_success"] for point in curve], marker="o")
-    success.axhline(99.0, color="grey", linewidth=0.8, linestyle="--")
-    success.set(xlabel="minutes of training", ylabel="success, %", ylim=(max(lowest - 2.0, 0.0), 101), xlim=(0, None))
-    error.plot(minutes, [point["position_error_cm"]["mean"] for point in curve], marker="o")
-    error.set(xlabel="minutes of training", ylabel="position error, cm", ylim=(0, None), xlim=(0, None))
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+def write(found: dict[str, Any], document: Path) -> None:
+    """Write the text and the picture of the report."""
+    picture = document.with_suffix(".png")
+    draw(found, picture)
+    document.with_suffix(".md").write_text(markdown(found, picture.name))
 
 
 def main() -> None:
@@ -279,24 +198,29 @@ def main() -> None:
     parser.add_argument(
         "--document", type=Path, default=Path("docs/learning"), help="where the report goes, without suffix"
     )
+    parser.add_argument("--report-only", action="store_true", help="write the report from its .json; train nothing")
     options = parser.parse_args()
+    data = options.document.with_suffix(".json")
+    if options.report_only:
+        if not data.exists():
+            parser.error(f"--report-only needs {data}, which is not there")
+        write(json.loads(data.read_text()), options.document)
+        return
     if options.steps % CURVE_STRIDE:
         parser.error(f"--steps must be a multiple of {CURVE_STRIDE}, got {options.steps}")
     if max(options.few) * options.choices > options.demonstrations:
         parser.error(
             f"--choices={options.choices} of {max(options.few)} need more than {options.demonstrations} demonstrations"
         )
-    report = Report(options)
-    run_chains([[record_stage(options.task, "hdril/learning", report.dataset, options.demonstrations)]])
-    report.train_curve()
-    run_chains([[report.final()]])
-    run_chains(report.chains(), options.jobs)
-    found = report.results()
+    study = Study(options)
+    run_chains([[record_stage(options.task, "hdril/learning", study.dataset, options.demonstrations)]])
+    study.train_curve()
+    run_chains([[study.final()]])
+    run_chains(study.chains(), options.jobs)
+    found = study.results()
     options.document.parent.mkdir(parents=True, exist_ok=True)
-    options.document.with_suffix(".json").write_text(json.dumps(found, indent=1))
-    picture = options.document.with_suffix(".png")
-    draw(found, picture)
-    options.document.with_suffix(".md").write_text(markdown(found, picture.name))
+    data.write_text(json.dumps(found, indent=1))
+    write(found, options.document)
     print(options.document.with_suffix(".md").read_text())
 
 
