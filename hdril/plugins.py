@@ -73,7 +73,7 @@ class Registry[T: Named](Mapping[str, T]):
         """
         claims = self._plugins.get(name, [])
         if len(claims) + (name in self._built_in) > 1:
-            owners = ["hdril itself"] * (name in self._built_in) + [_origin(claim) for claim in claims]
+            owners = ["hdril itself"] * (name in self._built_in) + sorted(_origin(claim) for claim in claims)
             raise PluginError(f"two {self._kind}s are named {name!r}: one is from {', another from '.join(owners)}")
         if name in self._built_in:
             return self._built_in[name]

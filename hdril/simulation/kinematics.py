@@ -34,31 +34,30 @@ class Chain:
 
     def __init__(self, urdf: Path, base: str, tool: str) -> None:
         root = ElementTree.parse(urdf).getroot()
-        parents = {joint.find("child").get("link"): joint for joint in root.findall("joint")}  # pyright: ignore
+        parents = {attribute(joint, "child", "link"): joint for joint in root.findall("joint")}
         pending, joints, link = np.eye(4), [], tool
         while link != base:
             if link not in parents:
                 raise ValueError(f"{urdf.name}: no chain from {base!r} to {tool!r}; it ends at {link!r}")
             joint = parents[link]
-            link = joint.find("parent").get("link")  # pyright: ignore
+            link = attribute(joint, "parent", "link")
             if joint.get("type") == "fixed":
                 pending = _origin(joint) @ pending
                 continue
             axis = joint.find("axis")
             if joint.get("type") != "revolute" or axis is None or axis.get("xyz", "").split() != ["0", "0", "1"]:
                 raise ValueError(f"{urdf.name}: joint {joint.get('name')!r} is not revolute about z")
-            limit = joint.find("limit")
-            joints.append((joint, _origin(joint), pending, limit))
+            joints.append((joint, _origin(joint), pending))
             pending = np.eye(4)
         joints.reverse()
         self.joints: tuple[Joint, ...] = tuple(
             Joint(
                 joint.get("name", ""),
                 (pending if i == 0 else joints[i - 1][2]) @ offset,
-                float(limit.get("lower")),  # pyright: ignore
-                float(limit.get("upper")),  # pyright: ignore
+                float(attribute(joint, "limit", "lower")),
+                float(attribute(joint, "limit", "upper")),
             )
-            for i, (joint, offset, _, limit) in enumerate(joints)
+            for i, (joint, offset, _) in enumerate(joints)
         )
         self._tool = joints[-1][2]
         self.lower = np.array([joint.lower for joint in self.joints])
@@ -94,6 +93,19 @@ class Chain:
         """Pose of the tool at joint positions ``q`` (n,), rad."""
         transform, _ = self.transform_and_jacobian(np.asarray(q, dtype=np.float64))
         return Pose(transform[:3, 3], Rotation.from_matrix(transform[:3, :3]).as_quat())
+
+
+def attribute(element: ElementTree.Element, child: str, name: str) -> str:
+    """An attribute of an element's child.
+
+    Raises:
+        ValueError: there is none.
+    """
+    found = element.find(child)
+    value = None if found is None else found.get(name)
+    if value is None:
+        raise ValueError(f"the {element.tag} {element.get('name')!r} has no <{child} {name}=…>")
+    return value
 
 
 def _origin(joint: ElementTree.Element) -> NDArray[np.float64]:

@@ -51,29 +51,37 @@ def base_name(name: str) -> str:
     return name.partition(":")[0]
 
 
-def get_task(name: str) -> Task:
-    """The task of that name, with its parameters if there are any: ``name`` or ``name:parameter=number,…``.
+def task_parameters(name: str) -> dict[str, float]:
+    """The parameters of a task: those that ``name`` gives, and the defaults of the others.
 
     Raises:
-        ValueError: unknown name or parameter, or a value that is not a number or out of range; lists the valid ones. Also
-            if the task is from another package and cannot be imported (:class:`~hdril.plugins.PluginError`).
+        ValueError: unknown name or parameter, or a value that is not a number; lists the valid ones. Also if the task is from
+            another package and cannot be imported (:class:`~hdril.plugins.PluginError`).
     """
     base, _, settings = name.partition(":")
-    task = TASKS.find(base)
-    if not settings:
-        return task
+    TASKS.find(base)
     build = getattr(TASKS.source(base), "make_task", None)
     known = signature(build).parameters if build else {}
-    values: dict[str, float] = {}
-    for setting in settings.split(","):
+    values = {parameter: float(entry.default) for parameter, entry in known.items()}
+    for setting in settings.split(",") if settings else ():
         parameter, _, text = setting.partition("=")
-        if build is None or parameter not in known:
+        if parameter not in known:
             raise ValueError(f"{base} has no parameter {parameter!r}; it has: {', '.join(known) or 'none'}")
         try:
             values[parameter] = float(text)
         except ValueError:
             raise ValueError(f"{parameter} must be a number, got {text!r}") from None
-    return replace(build(**values), name=name) if build else task
+    return values
 
 
-__all__ = ["TASKS", "Task", "Uniform", "base_name", "fixed", "get_task"]
+def get_task(name: str) -> Task:
+    """The task of that name, with its parameters if there are any: ``name`` or ``name:parameter=number,…``.
+
+    Raises:
+        ValueError: as :func:`task_parameters`, or a value that is out of range.
+    """
+    values, (base, _, settings) = task_parameters(name), name.partition(":")
+    return replace(TASKS.source(base).make_task(**values), name=name) if settings else TASKS[base]
+
+
+__all__ = ["TASKS", "Task", "Uniform", "base_name", "fixed", "get_task", "task_parameters"]

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from hdril.files import cache_folder, write_atomically
 from hdril.geometry import Pose
+from hdril.simulation.kinematics import attribute
 from hdril.simulation.robots.spec import Actuation, ArmSpec, GripperSpec, RobotSpec
 
 PACKAGE = "example-robot-data"
@@ -112,7 +113,7 @@ def simulation_urdf(meshes: bool) -> Path:
     tree = ElementTree.parse(source_urdf())
     root = tree.getroot()
     for joint in root.findall("joint"):
-        if joint.find("child").get("link") in LEFT_OUT:  # pyright: ignore
+        if attribute(joint, "child", "link") in LEFT_OUT:
             root.remove(joint)
     for link in root.findall("link"):
         if link.get("name") in LEFT_OUT:

@@ -1,0 +1,97 @@
+"""Who knows whom: which rooms of the house may import which, read from the source."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import hdril
+
+PACKAGE = Path(hdril.__file__).parent
+POLICY = PACKAGE.parent / "policies" / "lerobot_policy_hdril" / "src" / "lerobot_policy_hdril"
+
+BOTTOM = {"errors", "files", "geometry", "markdown", "plugins"}
+"""Modules that know nothing of robots and tasks. Every room may import them, and they import only one another."""
+
+BELOW: dict[str, set[str]] = {name: set() for name in BOTTOM} | {
+    "actor": set(),
+    "simulation": set(),
+    "tasks": {"simulation", "actor"},
+    "env": {"tasks"},
+    "rollout": {"env"},
+    "trace": {"rollout"},
+    "demonstrations": {"trace"},
+    "evaluation": {"trace", "demonstrations"},
+    "viewer": {"evaluation"},
+    "hub": {"evaluation"},
+    "lerobot_env": {"viewer"},
+    "cli": {"viewer", "hub", "lerobot_env"},
+}
+"""What each room may import, with everything below that. ``hdril/__init__.py`` may import tasks, to register them."""
+
+OF_THE_POLICY = {
+    "hub": {"lerobot_policy_hdril.card.CITATION", "lerobot_policy_hdril.card.EVALUATION"},
+    "cli": {"lerobot_policy_hdril.HDRILConfig"},  # hdril-bench times the training of the policy
+}
+"""What each room may import of the policy. Everything else is known through LeRobot's interface and ``explain()``."""
+
+
+def imports(file: Path) -> Iterator[str]:
+    """Dotted names of what a file imports, wherever in the file it does."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}: relative import"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def allowed(room: str) -> set[str]:
+    """The room itself, and everything below it."""
+    return BOTTOM.union({room}, *(allowed(other) for other in BELOW[room]))
+
+
+def sources() -> list[tuple[str, Path]]:
+    """Room and file of every module of hdril."""
+    files = sorted(file for file in PACKAGE.rglob("*.py") if file != PACKAGE / "__init__.py")
+    return [(file.relative_to(PACKAGE).parts[0].removesuffix(".py"), file) for file in files]
+
+
+SOURCES = pytest.mark.parametrize(
+    ("room", "file"), sources(), ids=[str(file.relative_to(PACKAGE)) for _, file in sources()]
+)
+
+
+def test_every_room_has_its_place() -> None:
+    assert {room for room, _ in sources()} == set(BELOW)
+
+
+@SOURCES
+def test_a_module_imports_only_what_is_below_it(room: str, file: Path) -> None:
+    known = {name.split(".")[1] for name in imports(file) if name.startswith("hdril.")} - {"__version__"}
+    assert known <= allowed(room), f"{room} may not import {', '.join(sorted(known - allowed(room)))}"
+
+
+@SOURCES
+def test_only_the_world_imports_pybullet(room: str, file: Path) -> None:
+    uses = {name for name in imports(file) if name.split(".")[0] in ("pybullet", "pybullet_data", "pybullet_utils")}
+    assert not uses or file == PACKAGE / "simulation" / "world.py"
+
+
+def test_the_package_itself_imports_tasks_alone() -> None:
+    known = {name.split(".")[1] for name in imports(PACKAGE / "__init__.py") if name.startswith("hdril.")}
+    assert known == {"tasks"}
+
+
+@pytest.mark.parametrize("file", sorted(POLICY.glob("*.py")), ids=lambda file: file.name)
+def test_the_policy_imports_nothing_of_hdril_or_pybullet(file: Path) -> None:
+    assert not {name for name in imports(file) if name.split(".")[0] in ("hdril", "pybullet")}
+
+
+@SOURCES
+def test_hdril_knows_little_of_the_policy(room: str, file: Path) -> None:
+    used = {name for name in imports(file) if name.startswith("lerobot_policy_hdril")}
+    assert used <= OF_THE_POLICY.get(room, set())
