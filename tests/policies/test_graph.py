@@ -12,8 +12,8 @@ from torch.nn import functional as F
 from torch_geometric.nn import GATConv, MessagePassing
 from torch_geometric.utils import softmax
 
-from hdril.control import ACTION_NAMES
 from hdril.geometry import Pose
+from hdril.simulation.actions import ACTION_NAMES
 
 NAMES = [*ACTION_NAMES, *(f"table.{axis}" for axis in ("x", "y", "z", "qx", "qy", "qz", "qw"))]
 
@@ -94,6 +94,32 @@ def test_relations_do_not_depend_on_where_the_scene_is() -> None:
     for node in group_nodes(NAMES).values():
         moved[:, node[:3]] += torch.tensor([0.3, -0.2, 0.1])
     torch.testing.assert_close(graph._relations(moved), graph._relations(state), atol=1e-4, rtol=1e-4)
+
+
+def flipped(state: torch.Tensor, groups: list[list[int]]) -> torch.Tensor:
+    """The same poses, with the other sign of these quaternions."""
+    other = state.clone()
+    for group in groups:
+        other[:, group] *= -1.0
+    return other
+
+
+@pytest.mark.parametrize("group", range(3))
+def test_relations_do_not_depend_on_the_sign_of_a_quaternion(group: int) -> None:
+    graph = ObjectAttention(NAMES, 16)
+    state = states(6)
+    other = flipped(state, [quaternion_groups(NAMES)[group]])
+    torch.testing.assert_close(graph._relations(other), graph._relations(state))
+
+
+def test_relational_coordinates_do_not_depend_on_the_sign_of_the_frames_quaternion() -> None:
+    frame = RelationalCoordinates(NAMES, NAMES[16:], [*ACTION_NAMES, *NAMES])
+    state = states(6)
+    other = flipped(state, [quaternion_groups(NAMES)[2]])
+    torch.testing.assert_close(frame.encode_state(other)[:, :16], frame.encode_state(state)[:, :16])
+    output = torch.cat([states(6)[:, :16], states(6)], dim=-1)[:, None]
+    torch.testing.assert_close(frame.encode_output(output, other), frame.encode_output(output, state))
+    torch.testing.assert_close(frame.decode_output(output, other), frame.decode_output(output, state))
 
 
 def complete(count: int) -> torch.Tensor:

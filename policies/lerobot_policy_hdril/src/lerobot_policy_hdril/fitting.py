@@ -20,8 +20,8 @@ from lerobot_policy_hdril.provenance import Origin, TrainingData, from_runs
 if TYPE_CHECKING:
     from lerobot_policy_hdril.modeling_hdril import HDRILPolicy
 
-GROWTH = 1.1
-"""Fit anew when so many times the episodes of the last fit are known, ..."""
+GROWTH = 10
+"""Fit anew when one new episode has come for every so many of the last fit, ..."""
 QUIET = 10
 """... or when so many batches in a row brought none. To fit all episodes anew after each straggler would cost more than
 that gives: of 4,700 shuffled episodes, the last arrives after some 570 batches."""
@@ -75,7 +75,7 @@ class LearnedEpisodes:
         run fits where an uninterrupted one does."""
         if not self._fits or self._count == self._fitted:
             return False
-        return self._quiet >= QUIET or self._count >= GROWTH * self._fitted
+        return self._quiet >= QUIET or GROWTH * (self._count - self._fitted) >= self._fitted
 
     def mark_fitted(self) -> None:
         """The fit is now of all episodes that were seen."""

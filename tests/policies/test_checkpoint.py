@@ -1,0 +1,204 @@
+"""Checkpoints: they resume bit for bit, overrides act or are refused, damaged or older ones say so."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.policies.factory import make_policy
+from lerobot_policy_hdril import HDRILConfig, HDRILPolicy
+from lerobot_policy_hdril.overrides import CHANGEABLE, check_overrides
+from safetensors.torch import load_file, save_file
+
+from tests.policies.tools import BATCH, FRAMES, VARIANTS, Training, assert_same, build, observation, tensors
+
+
+def save_training(folder: Path, training: Training) -> None:
+    _training_states().save_training_state(folder, 1, training.optimizer, training.scheduler)
+
+
+def load_training(folder: Path, training: Training) -> None:
+    _training_states().load_training_state(folder, training.optimizer, training.scheduler)
+
+
+def _training_states() -> Any:
+    """LeRobot's functions that write and read the state of a training; LeRobot 0.6 has them here."""
+    try:
+        from lerobot.common import train_utils
+    except ImportError as error:
+        raise AssertionError("lerobot.common.train_utils is gone: find what replaces it in this LeRobot") from error
+    missing = [name for name in ("save_training_state", "load_training_state") if not hasattr(train_utils, name)]
+    assert not missing, f"lerobot.common.train_utils has no {' or '.join(missing)}: find what replaces it"
+    return train_utils
+
+
+def resume(folder: Path, metadata) -> Training:
+    torch.manual_seed(7)
+    config = HDRILConfig.from_pretrained(folder / "pretrained_model")
+    config.pretrained_path = folder / "pretrained_model"
+    policy = make_policy(config, ds_meta=metadata)
+    assert isinstance(policy, HDRILPolicy)
+    training = Training(policy, 4)
+    load_training(folder, training)
+    return training
+
+
+def assert_resumes(batches: list[torch.Tensor], at: int, metadata, folder: Path, **values: Any) -> None:
+    """Train, with a checkpoint after ``at`` batches, as LeRobot's trainer writes and reads it: same weights, bit for bit."""
+    straight = Training(build(metadata, learned=False, **values), 4)
+    for step, index in enumerate(batches):
+        if step == at:
+            straight.policy.save_pretrained(folder / "pretrained_model")
+            save_training(folder, straight)
+            saved = {name: value.clone() for name, value in tensors(straight.policy).items()}
+        straight.step(index)
+    resumed = resume(folder, metadata)
+    assert_same(tensors(resumed.policy), saved)
+    # LeRobot restores the random generators with the training's state.
+    load_training(folder, resumed)
+    for index in batches[at:]:
+        resumed.step(index)
+    assert_same(tensors(resumed.policy), tensors(straight.policy))
+    assert resumed.policy.config.training_data == straight.policy.config.training_data
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_variant_resumes(variant: str, metadata, tmp_path: Path) -> None:
+    assert_resumes([BATCH[:12]] * 3, 1, metadata, tmp_path, **VARIANTS[variant])
+
+
+@pytest.mark.parametrize("at", [1, 2, 3])
+def test_resumes_while_episodes_are_still_joining(at: int, metadata, tmp_path: Path) -> None:
+    episodes = [[0, 3], [3, 0], [1], [1, 0], [5, 4]]
+    batches = [torch.tensor([FRAMES * e + 7 * i for e in group for i in range(4)]) for group in episodes]
+    assert_resumes(batches, at, metadata, tmp_path)
+
+
+# ---------------------------------------------------------------------- overrides
+
+
+@pytest.fixture(scope="module")
+def checkpoint(metadata, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of the paper's Res: five samples of a variational latent."""
+    folder = tmp_path_factory.mktemp("res")
+    build(metadata, preset="res", hidden_dim=32).save_pretrained(folder)
+    return folder
+
+
+def load(folder: Path, *overrides: str) -> HDRILPolicy:
+    return HDRILPolicy.from_pretrained(folder, config=HDRILConfig.from_pretrained(folder, cli_overrides=[*overrides]))
+
+
+def test_override_acts_whatever_the_preset(checkpoint: Path, metadata) -> None:
+    """0 samples are the default of the config, and not what the preset says: it acts all the same."""
+    sampled, mean, same = load(checkpoint), load(checkpoint, "--samples=0"), load(checkpoint, "--samples=5")
+    assert (sampled.config.samples, mean.config.samples, mean.config.preset) == (5, 0, "res")
+    first = observation(metadata, [0])
+    assert torch.equal(same.select_action(first), sampled.select_action(first))
+    assert not torch.equal(mean.select_action(first), sampled.select_action(first))
+    opened = load(checkpoint, "--rollout=open_loop", "--experts=separate", "--device=cpu")
+    assert (opened.config.rollout, opened.config.experts) == ("open_loop", "separate")
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("--interaction=object", r"policy\.interaction is 'none' in the checkpoint .*; got 'object'"),
+        ("--hidden_dim=128", r"policy\.hidden_dim is 32 .*; got 128"),
+        ("--skip=false", r"policy\.skip is True .*; got False"),
+        ("--per_primitive=true", r"policy\.per_primitive is False .*; got True"),
+        ("--preset=int", r"policy\.preset is 'res' .*; got 'int'"),
+        ("--preset=", r"policy\.preset is 'res' .*; got "),
+        ("--ridge=2", r"policy\.ridge is 1\.0 .*; got 2\.0"),
+    ],
+)
+def test_override_of_what_the_weights_fixed_is_refused(override: str, message: str, checkpoint: Path) -> None:
+    with pytest.raises(ValueError, match=message) as raised:
+        load(checkpoint, override)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("name", [entry.name for entry in fields(HDRILConfig) if entry.name not in CHANGEABLE])
+def test_every_field_is_fixed_unless_it_is_named_changeable(name: str, checkpoint: Path) -> None:
+    given, saved = (HDRILConfig.from_pretrained(checkpoint) for _ in range(2))
+    check_overrides(given, saved, "checkpoint")
+    setattr(given, name, "something else")
+    with pytest.raises(ValueError, match=rf"policy\.{name} is "):
+        check_overrides(given, saved, "checkpoint")
+
+
+def test_preset_contradicted_by_a_value_that_is_the_default() -> None:
+    with pytest.raises(ValueError, match=r"policy\.preset=res makes policy\.samples 5, but 0 was given; leave out one"):
+        HDRILConfig(device="cpu", push_to_hub=False, preset="res", samples=0)
+    assert HDRILConfig(device="cpu", push_to_hub=False, preset="res", samples=5).samples == 5
+    assert HDRILConfig(device="cpu", push_to_hub=False, preset="res", hidden_dim=128).hidden_dim == 128
+
+
+def test_replanning_is_limited_to_what_was_trained(metadata, tmp_path: Path) -> None:
+    build(metadata, replan_every=4).save_pretrained(tmp_path / "four")
+    for fine in (0, 4, 8):
+        assert load(tmp_path / "four", f"--replan_every={fine}").config.replan_every == fine
+    with pytest.raises(ValueError, match=r"must be 0 or a multiple of 4, because .* trained with 4; got 3"):
+        load(tmp_path / "four", "--replan_every=3")
+    build(metadata).save_pretrained(tmp_path / "none")
+    with pytest.raises(ValueError, match="must be 0, because the checkpoint was trained with 0; got 5"):
+        load(tmp_path / "none", "--replan_every=5")
+
+
+# ---------------------------------------------------------------------- damaged and older checkpoints
+
+
+@pytest.fixture
+def damaged(checkpoint: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(checkpoint, tmp_path / "damaged"))
+
+
+@pytest.mark.parametrize("kept", [0, 5, 1000, -10])
+def test_truncated_weights(kept: int, damaged: Path) -> None:
+    file = damaged / "model.safetensors"
+    file.write_bytes(file.read_bytes()[:kept])
+    with pytest.raises(ValueError, match=r"model\.safetensors is not a whole safetensors file: download") as raised:
+        load(damaged)
+    assert "\n" not in str(raised.value)
+
+
+def test_weights_that_are_missing_unknown_or_of_another_shape(damaged: Path) -> None:
+    file = damaged / "model.safetensors"
+    whole = load_file(file)
+    name = "planner.head.0.bias"
+    save_file({key: value for key, value in whole.items() if key != name}, file)
+    with pytest.raises(ValueError, match=rf"does not fit its config\.json: it lacks {name}"):
+        load(damaged)
+    save_file(whole | {"extra": torch.zeros(1)}, file)
+    with pytest.raises(ValueError, match="it has unknown extra"):
+        HDRILPolicy.from_pretrained(damaged)
+    save_file(whole | {name: torch.zeros(3)}, file)
+    with pytest.raises(ValueError, match=f"it has other shapes of {name}"):
+        load(damaged)
+    file.unlink()
+    with pytest.raises(FileNotFoundError, match="has no weights"):
+        load(damaged)
+
+
+def test_older_checkpoint_loads_without_provenance(damaged: Path, checkpoint: Path, metadata) -> None:
+    """It knows neither ``training_data`` nor ``capacity``. Further training keeps its fit, and says what it adds."""
+    values = json.loads((damaged / "config.json").read_text())
+    del values["training_data"], values["capacity"]
+    (damaged / "config.json").write_text(json.dumps(values))
+    older = load(damaged)
+    assert older.config.training_data[0].digest == ""
+    first = observation(metadata, [0])
+    assert torch.equal(older.select_action(first), load(checkpoint).select_action(first))
+    config = PreTrainedConfig.from_pretrained(damaged)
+    config.pretrained_path = damaged
+    tuned = make_policy(config, ds_meta=metadata)
+    assert isinstance(tuned, HDRILPolicy)
+    tuned.train().forward({"index": torch.tensor([FRAMES])})
+    assert_same(tensors(tuned), tensors(older))
+    assert [record.episodes for record in tuned.config.training_data] == [(), ((1, 1),)]
