@@ -2,8 +2,9 @@
 
 python scripts/missed_grasp.py --policy=outputs/table_lift/train/checkpoints/last/pretrained_model
 
-While the policy plays its first primitive, something else is done than it says: the hands stay where they are, or the fingers
-stay open, or the hands arrive too high. Afterwards it is on its own, for three times the task's length.
+While the policy plays its first primitive, its actions are changed: the hands stay where they are, or the fingers stay open, or
+the hands arrive too high. From then on its actions are left as they are. An episode lasts three times the task's horizon. The
+intervals are of one trained policy.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ MISHAPS: dict[str, Callable[[Action, Action], Action]] = {
 
 
 class Mishap:
-    """A policy whose actions of the first primitive are spoilt."""
+    """A policy whose actions are changed by ``spoil(action, first state)`` during the first ``frames`` frames."""
 
     def __init__(self, policy: LeRobotActor, spoil: Callable[[Action, Action], Action], frames: int) -> None:
         self._policy, self._spoil, self._frames = policy, spoil, frames
@@ -50,7 +51,7 @@ class Mishap:
         self._policy.reset(seed)
         self._start: Action | None = None
         self.executed: list[int] = []
-        """Labels of what the policy executed, frame by frame."""
+        """Labels of the primitives that the policy executed, frame by frame."""
 
     def act(self, observation: Observation) -> Decision:
         decision = self._policy.act(observation)
@@ -82,7 +83,7 @@ def main() -> None:
             again += actor.executed[first] == actor.executed[0]
         low, high = wilson_interval(successes, options.episodes)
         print(f"{name}: tried again at once in {again}, succeeded in {successes} of {options.episodes} "
-              f"({100 * low:.0f} to {100 * high:.0f} %)", flush=True)  # fmt: skip
+              f"(95 % interval {100 * low:.0f} to {100 * high:.0f} %)", flush=True)  # fmt: skip
     env.close()
 
 
