@@ -159,7 +159,9 @@ def resolve_config(checkpoint: Checkpoint, overrides: Iterable[str] = (), device
         reason = complaint.getvalue().strip().splitlines()[-1].partition("error: ")[2]
         raise ValueError(f"the policy's config cannot be made: {reason.replace('--', 'policy.')}") from None
     except draccus.utils.DraccusException as error:
-        raise ValueError(f"the config of {checkpoint.name} cannot be made: {error.__cause__ or error}") from error
+        # A value that cannot be read names its option; what the config's own check says is wrapped.
+        reason = error if isinstance(error, draccus.utils.DecodingError) else error.__cause__ or error
+        raise ValueError(f"the config of {checkpoint.name} cannot be made: {' '.join(str(reason).split())}") from error
     if config.device != device:
         raise ValueError(f"the device {device!r} is not available here; torch offers {config.device!r}")
     return config

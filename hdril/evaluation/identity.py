@@ -6,11 +6,10 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from inspect import signature
 from typing import Any
 
 from hdril.evaluation.software import SHORT, evaluation_software
-from hdril.tasks import TASKS, base_name, get_task
+from hdril.tasks import base_name, get_task, task_parameters
 
 Values = Mapping[str, Any]
 
@@ -85,15 +84,6 @@ def identify_trials(task: str, first_seed: int, num_episodes: int, max_frames: i
         )
     software = evaluation_software(base_name(task))
     return TrialsIdentity(base_name(task), task_parameters(task), first_seed, num_episodes, frames, software)
-
-
-def task_parameters(task: str) -> dict[str, float]:
-    """The parameters of a valid task: those that its name gives, and the defaults of the others."""
-    base, _, settings = task.partition(":")
-    build = getattr(TASKS.source(base), "make_task", None)
-    defaults = {name: float(entry.default) for name, entry in signature(build).parameters.items()} if build else {}
-    given = dict(setting.split("=") for setting in settings.split(",")) if settings else {}
-    return defaults | {name: float(value) for name, value in given.items()}
 
 
 def _leaves(values: Values, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:

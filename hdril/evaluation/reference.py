@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdril.env import BimanualEnv
-from hdril.evaluation.identity import digest_json, task_parameters
+from hdril.evaluation.identity import digest_json
 from hdril.evaluation.software import digest_file, episode_software
 from hdril.files import cache_folder, write_atomically
 from hdril.rollout import Ending
-from hdril.tasks import base_name
+from hdril.tasks import base_name, task_parameters
 from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.primitives import Noise
 from hdril.trace import Trace, trace_episode

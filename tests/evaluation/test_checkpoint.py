@@ -1,0 +1,127 @@
+"""Damaged checkpoints and overrides that cannot act: one line each, and nothing is written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.torch import load_file, save_file
+
+from hdril.cli.eval import EvalConfig, PolicySource, eval_command, split_overrides
+from hdril.evaluation.checkpoint import find_checkpoint, resolve_config
+from hdril.evaluation.lerobot_actor import LeRobotActor
+from hdril.tasks import get_task
+from tests.evaluation.checkpoints import listing, save_act, save_replay
+
+
+@pytest.fixture
+def replay(tmp_path: Path) -> Path:
+    return save_replay(tmp_path / "policy", np.zeros((2, 16)))
+
+
+@pytest.fixture(scope="module")
+def act(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_act(tmp_path_factory.mktemp("act") / "policy", dataset, None)
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-8])
+
+
+@pytest.mark.parametrize(
+    ("name", "damage", "message"),
+    [
+        (
+            "model.safetensors",
+            truncate,
+            r"policy/model\.safetensors is not a whole safetensors file: download or save it",
+        ),
+        ("model.safetensors", Path.unlink, r"is incomplete: model\.safetensors is missing"),
+        ("config.json", truncate, r"policy/config\.json is not valid JSON: "),
+        ("config.json", Path.unlink, r"no checkpoint at .*policy: it should be a folder with config\.json"),
+        ("policy_preprocessor.json", Path.unlink, r"is incomplete: policy_preprocessor\.json is missing"),
+        ("policy_postprocessor.json", truncate, r"policy/policy_postprocessor\.json is not valid JSON"),
+    ],
+)
+def test_damaged_files_are_named(replay: Path, tmp_path: Path, name: str, damage, message: str) -> None:
+    damage(replay / name)
+    before = listing(tmp_path)
+    with pytest.raises((ValueError, FileNotFoundError), match=message) as caught:
+        eval_command(EvalConfig(PolicySource(str(replay)), output_dir=tmp_path / "out/eval"))
+    assert "\n" not in str(caught.value)
+    assert listing(tmp_path) == before
+
+
+def test_files_that_the_processors_name_are_checked(act: Path, dataset: Path, tmp_path: Path) -> None:
+    folder = save_act(tmp_path / "policy", dataset, None)
+    (state,) = folder.glob("policy_preprocessor_*.safetensors")
+    whole = state.read_bytes()
+    truncate(state)
+    with pytest.raises(ValueError, match=f"{state.name} is not a whole safetensors file"):
+        find_checkpoint(str(folder))
+    state.unlink()
+    with pytest.raises(FileNotFoundError, match=f"is incomplete: {state.name} is missing"):
+        find_checkpoint(str(folder))
+    state.write_bytes(whole)
+    assert state in find_checkpoint(str(folder)).processors
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("--bogus=7", r"replay has no option policy\.bogus; it has: .*labels.*scale"),
+        ("--scale", r"policy\.scale must be given with its value, as --policy\.scale=VALUE"),
+        ("--scale=big", r"cannot be made: .*scale"),
+        ("--repo_id=a/b", r"policy\.repo_id cannot change an evaluation; what can: .*scale"),
+        ("--type=act", r"replay has no option policy\.type"),
+    ],
+)
+def test_overrides_that_cannot_act_are_refused(replay: Path, tmp_path: Path, override: str, message: str) -> None:
+    before = listing(tmp_path)
+    with pytest.raises(ValueError, match=message) as caught:
+        eval_command(EvalConfig(PolicySource(str(replay)), output_dir=tmp_path / "out/eval"), (override,))
+    assert "pretrained_path" not in str(caught.value)
+    assert listing(tmp_path) == before
+
+
+def test_options_of_training_cannot_change_an_evaluation(act: Path) -> None:
+    with pytest.raises(
+        ValueError, match=r"policy\.optimizer_lr cannot change an evaluation; what can: .*temporal_ensemble"
+    ):
+        resolve_config(find_checkpoint(str(act)), ("--optimizer_lr=1",))
+    config = resolve_config(find_checkpoint(str(act)), ("--n_action_steps=3",))
+    assert config.n_action_steps == 3  # pyright: ignore
+
+
+def test_unknown_types_of_policies_are_named(replay: Path) -> None:
+    config = replay / "config.json"
+    config.write_text(config.read_text().replace('"replay"', '"dreamer"'))
+    with pytest.raises(ValueError, match=r"is of a policy of the type 'dreamer'; installed: .*act.*hdril"):
+        resolve_config(find_checkpoint(str(replay)))
+
+
+def test_weights_that_are_missing_or_left_over_are_named(act: Path, dataset: Path, tmp_path: Path) -> None:
+    """LeRobot by itself would go on, with random numbers in the place of what is missing."""
+    folder, task = save_act(tmp_path / "policy", dataset, None), get_task("table_lift")
+    weights = load_file(folder / "model.safetensors")
+    save_file({name: value for name, value in weights.items() if name != "model.action_head.bias"},
+              folder / "model.safetensors")  # fmt: skip
+    with pytest.raises(ValueError, match=r"model\.safetensors does not fit .*model\.action_head\.bias") as caught:
+        LeRobotActor(str(folder), task)
+    assert "\n" not in str(caught.value)
+    save_file(weights | {"model.third_arm": weights["model.action_head.bias"].clone()}, folder / "model.safetensors")
+    with pytest.raises(ValueError, match=r"does not fit the policy's config: .*model\.third_arm"):
+        LeRobotActor(str(folder), task)
+    save_file(weights, folder / "model.safetensors")
+    with pytest.raises(ValueError, match=r"does not fit the policy's config: .*model\.encoder"):
+        LeRobotActor(str(folder), task, ("--n_encoder_layers=2",))
+    LeRobotActor(str(folder), task)
+
+
+def test_overrides_are_told_from_options_of_the_command() -> None:
+    ours, theirs = split_overrides(
+        ["--policy.path=p", "--policy.rollout=open_loop", "--seed=1", "--policy.device=cuda"]
+    )
+    assert ours == ["--policy.path=p", "--seed=1", "--policy.device=cuda"]
+    assert theirs == ("--rollout=open_loop",)
