@@ -18,6 +18,8 @@ from lerobot.scripts.lerobot_eval import eval_policy
 from lerobot_policy_hdril import HDRILConfig
 
 from hdril.lerobot_env import HDRILEnvConfig
+from hdril.simulation.actions import hand_slice
+from hdril.simulation.robots import SIDES
 from hdril.tasks import TASKS, get_task
 from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.primitives import Noise
@@ -48,7 +50,7 @@ class Scripted(PreTrainedPolicy):
         for (expert, spoiled), state, row in zip(self.experts, states, objects, strict=True):
             action = expert.act({"agent_pos": state, "environment_state": row}).action
             if spoiled:
-                action[[7, 15]] = 1.0
+                action[[hand_slice(side).stop - 1 for side in SIDES]] = 1.0  # open hands
             actions.append(torch.from_numpy(action))
         return torch.stack(actions).float()
 
@@ -114,6 +116,21 @@ def test_types_are_registered() -> None:
 def test_unknown_task_is_named() -> None:
     with pytest.raises(ValueError, match=r"unknown task 'chess'; choose from: .*table_lift"):
         make_env(HDRILEnvConfig(task="chess"))
+
+
+def test_unknown_robot_is_named() -> None:
+    with pytest.raises(ValueError, match=r"^unknown robot 'hal'; choose from: baxter"):
+        make_env(HDRILEnvConfig(robot="hal"), n_envs=2, use_async_envs=True)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_an_episode_shorter_than_the_horizon_is_refused_before_a_worker_starts(task: str) -> None:
+    horizon = get_task(task).horizon
+    with pytest.raises(ValueError, match=rf"^env\.episode_length must be at least {horizon}, got {horizon - 1}: "):
+        make_env(HDRILEnvConfig(task=task, episode_length=horizon - 1), n_envs=2, use_async_envs=True)
+    vector = make_env(HDRILEnvConfig(task=task, episode_length=horizon + 5), n_envs=1)["hdril"][0]
+    with closing(vector):
+        assert vector.call("_max_episode_steps") == (horizon + 5,)
 
 
 def test_videos_can_be_drawn() -> None:

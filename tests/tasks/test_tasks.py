@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from gymnasium.utils.env_checker import check_env
 
 from hdril.env import BimanualEnv
 from hdril.geometry import Pose
-from hdril.simulation.actions import hand_slice, openings
+from hdril.simulation.actions import hand_poses, hand_slice, openings
 from hdril.simulation.kinematics import Chain
 from hdril.simulation.robots import SIDES
 from hdril.simulation.world import ROBOT, World
@@ -90,8 +91,6 @@ def test_same_seed_same_trajectory_bit_for_bit(env: BimanualEnv, task: str) -> N
         "import hashlib, sys; from tests.tasks.test_tasks import play; from hdril.env import BimanualEnv;"
         f"print(hashlib.sha256(play(BimanualEnv({task!r}), 7, frames=40)[0].tobytes()).hexdigest())"
     )
-    import hashlib
-
     printed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert printed.split()[-1] == hashlib.sha256(first.tobytes()).hexdigest()
 
@@ -181,17 +180,18 @@ def test_the_arms_collide_with_each_other(env: BimanualEnv, task: str) -> None:
     """Hands that are sent to the same place push each other away."""
     observation, _ = env.reset(seed=0)
     action = observation["agent_pos"].copy()
-    middle = 0.5 * (action[:3] + action[8:11])
+    left, right = (action[hand_slice(side)][:3] for side in SIDES)  # views
+    middle = 0.5 * (left + right)
     middle[2] += 0.15
     touched = False
     for _ in range(20):
-        step = np.clip(middle - action[:3], -0.04, 0.04)
-        action[:3] += step
-        action[8:11] += np.clip(middle - action[8:11], -0.04, 0.04)
+        for position in (left, right):
+            position += np.clip(middle - position, -0.04, 0.04)
         observation, *_ = env.step(action)
         touched |= bool(env.world.contacts(ROBOT, ROBOT))
     assert touched
-    assert np.linalg.norm(observation["agent_pos"][:3] - observation["agent_pos"][8:11]) > 0.03
+    positions = hand_poses(observation["agent_pos"][None])[0, :, :3]
+    assert np.linalg.norm(positions[0] - positions[1]) > 0.03
 
 
 def test_an_arm_collides_with_the_torso(env: BimanualEnv) -> None:
