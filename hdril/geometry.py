@@ -1,7 +1,7 @@
-"""Rigid poses. Quaternions are (x, y, z, w), as PyBullet and SciPy have them.
+"""Rigid poses. Quaternions are (x, y, z, w), as in PyBullet and SciPy.
 
-The algebra is written out on plain floats: an episode composes thousands of poses one by one, and SciPy's ``Rotation``
-takes 60 microseconds for each, a tenth of the whole simulation.
+The algebra is written out on plain floats, because an episode composes thousands of poses one by one: with SciPy's
+``Rotation``, at 60 microseconds each, they would take a tenth of the simulation's time.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def interpolate(start: Pose, end: Pose, fraction: float) -> Pose:
     position = (1.0 - fraction) * start.position + fraction * end.position
     goal = end.aligned_to(start.quaternion).quaternion
     half = 0.5 * float(geodesic_distance(start.quaternion, goal))
-    if half < 1e-6:  # the sine below would be divided by itself, both lost in rounding
+    if half < 1e-6:  # sin(half) is too small to divide by
         quaternion = (1.0 - fraction) * start.quaternion + fraction * goal
     else:
         quaternion = (
@@ -128,8 +128,8 @@ def interpolate(start: Pose, end: Pose, fraction: float) -> Pose:
 def geodesic_distance(a: ArrayLike, b: ArrayLike) -> NDArray[np.float64]:
     """Angle between orientations, rad, in [0, pi], for (..., 4) arrays.
 
-    2 arctan2(|a - b|, |a + b|) twice over, with the sign of b that is nearer: the arctangent keeps its accuracy at
-    small angles, where 2 arccos(|a . b|) loses half of the digits.
+    4 arctan2(|a - b|, |a + b|), with the sign of b that is nearer to a. The arctangent is accurate at small angles, where
+    2 arccos(|a . b|) loses half of the digits.
     """
     a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
     minus, plus = np.square(a - b).sum(-1), np.square(a + b).sum(-1)

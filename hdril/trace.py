@@ -1,4 +1,4 @@
-"""One episode, frame by frame, with all that a viewer or a judge wants of it."""
+"""One episode, frame by frame, with all that viewers draw and scores are computed from."""
 
 from __future__ import annotations
 
@@ -17,20 +17,22 @@ from hdril.simulation.world import ROBOT
 
 @dataclass(frozen=True)
 class Trace:
-    """Everything that a viewer wants of one episode of T frames. States have T + 1 rows: the last is after the end."""
+    """One episode of T frames. States have T + 1 rows, because they also hold what was observed after the last action."""
 
     state: NDArray[np.float32]  # (T + 1, 16)
     environment_state: NDArray[np.float32]  # (T + 1, 7 per object)
     action: NDArray[np.float32]  # (T, 16)
     joints: NDArray[np.float64]  # (T + 1, joints of the robot)
     reward: NDArray[np.float32]  # (T,)
-    scripted: NDArray[np.int64]  # (T,), label of the expert; -1 past its end
+    scripted: NDArray[np.int64]  # (T,), label of the expert; -1 after its last frame
     explanations: tuple[Explanation | None, ...]  # (T,)
     ik_failures: tuple[str, ...]  # (T,), empty strings where there was none
-    stage: NDArray[np.int64]  # (T + 1,), how many of the task's stages were reached, success being the last
+    stage: NDArray[np.int64]  # (T + 1,), how many of the task's stages were reached; success is the last
     measures: NDArray[np.float64]  # (T + 1, measures of the task)
-    ik_error: NDArray[np.float64]  # (T, 2), m: how far inverse kinematics stayed from the commands, left and right
-    grip_force: NDArray[np.float64]  # (T + 1, 2), N: what the pads of each hand press on objects with
+    ik_error: NDArray[
+        np.float64
+    ]  # (T, 2), m: distance of the solution of inverse kinematics from the command, left and right
+    grip_force: NDArray[np.float64]  # (T + 1, 2), N: force of the pads of each hand on objects
     contacts: dict[str, NDArray[np.bool_]]  # (T + 1,) by "first, second": whether they touch
 
     @property
@@ -40,13 +42,15 @@ class Trace:
 
     @property
     def predicted(self) -> NDArray[np.int64]:
-        """(T,), label of the primitive that the planner finds most probable; -1 if there is no planner. The actor follows
-        the planner when a primitive is over, so the two may differ until then."""
+        """(T,), label of the primitive that the planner finds most probable; -1 if there is no planner.
+
+        It may differ from :attr:`executed`: the actor asks the planner only when a primitive is over.
+        """
         return np.array([-1 if e is None else int(e.probabilities.argmax()) for e in self.explanations])
 
 
 def _contacts(env: BimanualEnv) -> tuple[NDArray[np.float64], dict[str, bool]]:
-    """Pressure (2,), N, of the pads of each hand on objects, and which bodies touch, for those that move."""
+    """Force (2,), N, of the pads of each hand on observed objects, and which pairs of bodies touch."""
     world, task = env.world, env.task_spec
     force, touching = np.zeros(len(SIDES)), {}
     for i, name in enumerate(task.observed):

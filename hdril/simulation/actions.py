@@ -1,4 +1,4 @@
-"""What the hands are told: 16 numbers, or a command for each hand."""
+"""Actions: 16 numbers, or a command for each hand."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def openings(rows: NDArray[np.floating]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class HandCommand:
-    """What one hand is told: a tool pose in the world, and an opening from 0 (closed) to 1."""
+    """The command of one hand: a tool pose in the world, and an opening from 0 (closed) to 1."""
 
     pose: Pose
     opening: float

@@ -63,9 +63,9 @@ class Camera:
 class World:
     """A PyBullet world with a robot and bodies, addressed by name.
 
-    Every episode gets a world of its own, which takes 50 to 100 ms. To save and restore one state would take less, but what
-    PyBullet restores differs in the last digits once the robot has touched something, and an episode could not be made
-    again bit for bit. Once the world has stepped, nothing here moves a body but :meth:`step`.
+    Every episode gets a world of its own, which takes 50 to 100 ms. Restoring a saved state would be faster, but after a
+    contact PyBullet restores it with other last digits, and the episode could not be repeated bit for bit. Once the world has
+    stepped, only :meth:`step` moves bodies.
     """
 
     def __init__(self, physics: Physics | None = None) -> None:
@@ -257,11 +257,11 @@ class World:
         return [
             Contact(self._link_names[a][point[3]], self._link_names[b][point[4]], np.array(point[5]), float(point[9]))
             for point in points
-            if point[8] <= 0.0  # a positive distance is a warning of a contact to come
+            if point[8] <= 0.0  # a positive distance is a contact that is near, but not made
         ]
 
     def state_vector(self) -> NDArray[np.float64]:
-        """Everything that moves, in one vector: to compare two runs bit for bit."""
+        """Poses of all bodies, positions and velocities of all joints, in one vector, to compare two runs bit for bit."""
         parts: list[float] = []
         for body in self._ids.values():
             base = self._call("getBasePositionAndOrientation", body)

@@ -7,7 +7,7 @@ BENCH_HEIGHT = 0.23
 BENCH = BodySpec(
     "bench",
     (Box((1.10, 2.20, BENCH_HEIGHT), (0.0, 0.0, -BENCH_HEIGHT / 2), (0.86, 0.87, 0.88, 1.0)),),
-    # With 0.5 a table that is pulled at its handles tips before it slides; nothing needs to stick to the bench.
+    # With 0.5, a table that is pulled at its handles tips before it slides.
     friction=0.3,
     anchored=False,
 )

@@ -1,5 +1,7 @@
-"""Success and progress, as small parts that compose. A condition reads the world and says whether it holds, a measure reads
-a number, and a stage is a step on the way that conditions mark."""
+"""Success and progress, as small parts that compose.
+
+A condition tests the world, a measure reads a number from it, and a stage is a step on the way to success.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ from hdril.simulation.world import World
 
 @dataclass(frozen=True)
 class Condition:
-    """A named test of the world; ``name`` is what reports say when it fails."""
+    """A named test of the world. Reports print ``name`` when it fails."""
 
     name: str
     holds: Callable[[World], bool]
@@ -21,7 +23,7 @@ class Condition:
 
 @dataclass(frozen=True)
 class Measure:
-    """A named number of the world, for logs; ``name`` ends in its unit."""
+    """A named number that is read from the world, for logs. ``name`` ends in its unit."""
 
     name: str
     read: Callable[[World], float]
@@ -29,7 +31,10 @@ class Measure:
 
 @dataclass(frozen=True)
 class Stage:
-    """A step on the way to success: reached at the first frame at which its conditions hold, after the stages before."""
+    """A step on the way to success.
+
+    It is reached at the first frame at which its conditions hold and all stages before it have been reached.
+    """
 
     name: str
     conditions: tuple[Condition, ...]
@@ -57,10 +62,12 @@ def at_height(body: str, height: float, tolerance: float = 0.01) -> Condition:
 
 
 def touching(body: str, other: str) -> Condition:
+    """The two bodies have a contact point."""
     return Condition(f"{body} on {other}", lambda world: bool(world.contacts(body, other)))
 
 
 def not_touching(body: str, other: str) -> Condition:
+    """The two bodies have no contact point."""
     return Condition(f"{body} free of {other}", lambda world: not world.contacts(body, other))
 
 

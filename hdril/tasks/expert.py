@@ -1,4 +1,4 @@
-"""The scripted expert. It sees what a learned policy sees, and answers with the same 16 numbers and its primitive."""
+"""The scripted expert. It gets the observations of a learned policy, and answers with an action and its primitive."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ class ScriptedExpert:
         return Decision(action, Explanation(self._label, self._certain[self._label]))
 
     def _scene(self, observation: Observation) -> Scene:
-        # What the hands were told, not where they are: a hand that holds is pulled away from its target, and planning
-        # from there would let go of the load a little at every primitive.
+        # Planned from the last commands, not from the measured hands: a load pulls a hand away from its target, and planning
+        # from there would loosen the grip a little with every primitive.
         hands = self._hands or split_action(observation["agent_pos"])
         vectors = np.asarray(observation["environment_state"], dtype=np.float64).reshape(-1, 7)
         return Scene(

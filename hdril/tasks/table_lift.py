@@ -35,7 +35,7 @@ TABLE = BodySpec(
         ),
         *(Box((0.08, 0.025, 0.09), (0.0, y, TOP + 0.045), DARK) for y in (-HANDLE_Y, HANDLE_Y)),
     ),
-    # A table of 0.5 kg can be lifted by one arm; tests hold either arm alone to failing at this mass.
+    # One arm can lift a table of 0.5 kg. Tests check that one arm fails at this mass.
     mass=2.0,
 )
 PLATFORM = BodySpec("platform", (Box((0.30, 0.90, PLATFORM_HEIGHT), (0.0, 0.0, PLATFORM_HEIGHT / 2), STEEL),))

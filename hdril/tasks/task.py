@@ -1,4 +1,4 @@
-"""What a task is made of."""
+"""The parts of a task."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Task:
 
     ``bodies`` stand at ``placements[name]`` when an episode starts; those in ``observed`` are in the observation, in
     this order. Success is judged from frame ``horizon`` on, when the primitives are over. ``measures`` and ``stages`` are
-    logged at every frame: they say how far a failed episode came. The last stage is success itself and is not listed.
+    logged at every frame, to show how far a failed episode came. Success itself is the last stage and is not listed.
     """
 
     name: str
@@ -99,7 +99,7 @@ class Task:
         return {measure.name: measure.read(world) for measure in self.measures}
 
     def stages_reached(self, world: World, before: int) -> int:
-        """How many stages have been reached, given how many had been a frame ago."""
+        """How many stages have been reached, given how many had been at the frame before."""
         while before < len(self.stages) and not failed(self.stages[before].conditions, world):
             before += 1
         return before

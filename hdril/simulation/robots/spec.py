@@ -1,4 +1,4 @@
-"""What the rest of the library knows of a two-armed robot."""
+"""The description of a two-armed robot."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ class ArmSpec:
 
 @dataclass(frozen=True)
 class Actuation:
-    """Everything about the drives that the simulator is told, in one place.
+    """The settings of the drives.
 
     ``efforts`` replaces the URDF's limits (Nm or N), joint by joint: a departure from the model, to be justified where
     it is set. ``arm_gain`` and ``finger_gain`` are PyBullet's dimensionless position gains. ``finger_gear_force``, N, is
-    what the gear between the two fingers of a hand can take. ``velocities`` are the arm joints' speed limits, rad/s:
+    the largest force of the gear between the two fingers of a hand. ``velocities`` are the arm joints' speed limits, rad/s:
     targets move no faster. ``pad_torsion`` is PyBullet's spinning friction, m: the lever arm of friction about a
     contact's normal, which point contacts lack.
     """
@@ -81,7 +81,7 @@ class RobotSpec:
     """Pairs of links that may overlap, given all links."""
     base_link: str = "base"
     hand_reference: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0)
-    """Observed hand orientations get the sign that agrees with this quaternion, so that it never jumps."""
+    """Observed hand orientations have a non-negative product with this quaternion, so that their sign does not jump."""
 
     def __post_init__(self) -> None:
         if tuple(self.arms) != SIDES:
