@@ -55,6 +55,14 @@ def test_dtw_is_the_mean_distance_along_the_optimal_path(first: int, second: int
     assert dtw_distance(a, b) == pytest.approx(np.mean(distances), rel=1e-9)
 
 
+def test_dtw_takes_numbers_of_any_precision_and_memory_layout() -> None:
+    a, b = (np.round(100 * walk(np.random.default_rng(seed), 20)) for seed in range(2))
+    expected = dtw_distance(a, b)
+    for kind in (np.float32, np.int64):
+        assert dtw_distance(a.astype(kind), b) == dtw_distance(a, b.astype(kind)) == expected
+    assert dtw_distance(np.asfortranarray(a), b) == dtw_distance(a, np.asfortranarray(b)) == expected
+
+
 def test_dtw_forgives_a_delay() -> None:
     late = np.concatenate([line(50)[:1].repeat(8, 0), line(50)[:20], line(50)[19:20].repeat(5, 0), line(50)[20:]])
     assert dtw_distance(late, line(50)) == pytest.approx(0.0, abs=1e-12)

@@ -20,7 +20,9 @@ from hdril.evaluation.statistics import (
 )
 
 Z = 1.959963984540054
-TABLES = [PairedCounts(*counts) for counts in ((36, 12, 2, 0), (150, 20, 8, 22), (60, 3, 3, 34), (5, 0, 9, 6))]
+TABLES = [
+    PairedCounts(*counts) for counts in ((36, 12, 2, 0), (150, 20, 8, 22), (60, 3, 3, 34), (5, 0, 9, 6), (3, 1, 2, 1))
+]
 
 
 def exchanged(counts: PairedCounts) -> PairedCounts:
@@ -34,7 +36,7 @@ def wilson_by_hand(k: int, n: int, z: float = Z) -> tuple[float, float]:
     return middle - half, middle + half
 
 
-@pytest.mark.parametrize(("k", "n"), [(0, 10), (97, 100), (120, 120)])
+@pytest.mark.parametrize(("k", "n"), [(0, 10), (97, 100), (120, 120), (1, 1)])
 def test_wilson_interval_matches_its_formula(k: int, n: int) -> None:
     assert wilson_interval(k, n) == pytest.approx(wilson_by_hand(k, n), abs=1e-9)
     assert wilson_interval(k, n, confidence=0.6826894921) == pytest.approx(wilson_by_hand(k, n, 1.0), abs=1e-6)
@@ -55,6 +57,12 @@ def test_pairs_are_counted_by_seed() -> None:
     assert paired_counts(first, second) == PairedCounts(both=1, first_only=3, second_only=1, neither=1)
     assert paired_counts(first, second).trials == 6
     assert paired_counts(first, second).difference == pytest.approx(2 / 6)
+
+
+def test_each_kind_of_pair_has_a_count_of_its_own() -> None:
+    kinds = [(True, True)] * 2 + [(True, False)] * 3 + [(False, True)] * 5 + [(False, False)] * 7
+    first, second = ({seed: kind[i] for seed, kind in enumerate(kinds)} for i in range(2))
+    assert paired_counts(first, second) == PairedCounts(both=2, first_only=3, second_only=5, neither=7)
 
 
 def test_outcomes_of_other_seeds_are_not_pairs() -> None:
@@ -100,18 +108,19 @@ def test_difference_interval_is_newcombes() -> None:
     assert paired_difference_interval(TABLES[0]) == pytest.approx((0.0569, 0.3404), abs=5e-5)
 
 
+@pytest.mark.parametrize(("z", "confidence"), [(Z, 0.95), (1.0, 0.6826894921)])
 @pytest.mark.parametrize("counts", TABLES, ids=str)
-def test_difference_interval_matches_its_formula(counts: PairedCounts) -> None:
+def test_difference_interval_matches_its_formula(counts: PairedCounts, z: float, confidence: float) -> None:
     a, b, c, d = astuple(counts)
     n = a + b + c + d
     p, q = (a + b) / n, (a + c) / n
-    (l1, u1), (l2, u2) = wilson_by_hand(a + b, n), wilson_by_hand(a + c, n)
+    (l1, u1), (l2, u2) = wilson_by_hand(a + b, n, z), wilson_by_hand(a + c, n, z)
     product = a * d - b * c
     corrected = product - n / 2 if product > n / 2 else min(product, 0)
     phi = corrected / sqrt((a + b) * (c + d) * (a + c) * (b + d))
     low = p - q - sqrt((p - l1) ** 2 - 2 * phi * (p - l1) * (u2 - q) + (u2 - q) ** 2)
     high = p - q + sqrt((u1 - p) ** 2 - 2 * phi * (u1 - p) * (q - l2) + (q - l2) ** 2)
-    assert paired_difference_interval(counts) == pytest.approx((low, high), abs=1e-9)
+    assert paired_difference_interval(counts, confidence) == pytest.approx((low, high), abs=1e-6)
 
 
 @pytest.mark.parametrize("counts", [*TABLES, PairedCounts(50, 0, 0, 0), PairedCounts(0, 9, 0, 0)], ids=str)
@@ -156,6 +165,7 @@ def test_trainings_are_not_pooled() -> None:
     assert spread.mean == pytest.approx(0.95)
     assert spread.sd == pytest.approx(0.05)
     assert str(spread) == "3 × 200: 95.0 % (90.0 to 100.0, SD 5.0)"
+    assert str(TrainingSpread((200, 120, 40), 200)) == "3 × 200: 60.0 % (20.0 to 100.0, SD 40.0)"
 
 
 def test_one_training_has_no_spread() -> None:
