@@ -2,7 +2,7 @@
 
 python scripts/damage.py outputs/demo/train/checkpoints/last/pretrained_model outputs/damaged lift
 
-A policy that fails for a known reason, to try tools on that are to find the reason.
+The copy fails for a known reason. Tools that look for reasons can be tried on it.
 """
 
 from __future__ import annotations
@@ -18,19 +18,21 @@ def damage(checkpoint: Path, output: Path, primitive: str) -> None:
 
     Raises:
         FileExistsError: there is something at ``output``.
-        ValueError: the policy has no model for such a primitive alone.
+        ValueError: it is no HDR-IL policy, or has no model for this primitive alone.
     """
     from lerobot_policy_hdril import HDRILConfig
     from safetensors.torch import load_file, save_file
 
     config = HDRILConfig.from_pretrained(checkpoint)
-    if primitive not in config.primitives or not config.per_primitive:  # pyright: ignore
-        names = config.primitives if config.per_primitive else []  # pyright: ignore
-        raise ValueError(f"no model of its own for {primitive!r}; there is one for: {', '.join(names) or 'none'}")
+    if not isinstance(config, HDRILConfig):
+        raise ValueError(f"{checkpoint} is a policy of type {config.type!r}, not hdril")
+    own = config.primitives if config.per_primitive else []
+    if primitive not in own:
+        raise ValueError(f"no model of its own for {primitive!r}; there is one for: {', '.join(own) or 'none'}")
     if output.exists():
         raise FileExistsError(f"{output} exists; choose another folder or delete it")
     weights = load_file(checkpoint / "model.safetensors")
-    prefix = f"dynamics.{config.primitives.index(primitive)}."  # pyright: ignore
+    prefix = f"dynamics.{own.index(primitive)}."
     for name, value in weights.items():
         if name.startswith(prefix):
             value.zero_()

@@ -1,0 +1,38 @@
+"""hdril-bench measures what it says."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from hdril.cli.bench import BenchConfig, Figure, bench_command, bench_recording
+from hdril.simulation.world import World
+
+
+def test_recordings_share_is_of_the_time_that_passed(tmp_path: Path) -> None:
+    """And the simulator is as before afterwards."""
+    step = World.step
+    figure = bench_recording("table_lift", 1, tmp_path / "set")
+    assert World.step is step
+    assert 0.0 < figure.value < 100.0
+    assert (tmp_path / "set/meta/info.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("value", "at_least", "verdict"),
+    [(1.9, True, "MISS"), (2.0, True, "ok  "), (2.0, False, "ok  "), (2.1, False, "MISS")],
+)
+def test_a_figure_that_misses_its_limit_says_so(value: float, at_least: bool, verdict: str) -> None:
+    bound = "at least 2" if at_least else "at most 2"
+    assert str(Figure("speed", value, 2.0, at_least, "times")) == f"{verdict}  speed: {value:.2f} times ({bound})"
+
+
+@pytest.mark.long
+def test_every_figure_is_measured(capsys) -> None:
+    bench_command(BenchConfig(episodes=2, train_steps=20))
+    lines = capsys.readouterr().out.strip().splitlines()
+    assert len(lines) == 7
+    for line in lines:
+        assert re.fullmatch(r"(ok  |MISS)  .+: [\d.]+ (%|ms|times) \(at (least|most) [\d.]+\)", line), line
