@@ -57,6 +57,15 @@ def test_errors_are_in_centimetres_and_radians() -> None:
     assert outcome.angle_error_rad == pytest.approx(0.1, rel=1e-5)
 
 
+def test_errors_are_means_over_frames() -> None:
+    """The same in the last three of seven rows alone."""
+    away = moved(trace(), 4, ACROSS, hand=1)
+    away.state[4:, 8 + 3 : 8 + 7] = [0.0, 0.0, np.sin(0.1), np.cos(0.1)]
+    outcome = score(away)
+    assert outcome.position_error_cm == pytest.approx(0.5 * 3 / 7, rel=1e-5)
+    assert outcome.angle_error_rad == pytest.approx(0.1 * 3 / 7, rel=1e-5)
+
+
 def test_an_error_belongs_to_the_primitive_whose_action_led_to_it() -> None:
     """Rows 3 and 4 are where the actions of frames 2 and 3 led, which are move; the last row is where lift ends."""
     away = moved(moved(trace(), 3, ACROSS, hand=0), 5, (0.0, 0.0, -0.01), hand=0)
