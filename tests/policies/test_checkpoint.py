@@ -12,7 +12,7 @@ import pytest
 import torch
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import make_policy
-from lerobot_policy_hdril import HDRILConfig, HDRILPolicy
+from lerobot_policy_hdril import HDRILConfig, HDRILPolicy, fitting
 from lerobot_policy_hdril.overrides import CHANGEABLE, check_overrides
 from safetensors.torch import load_file, save_file
 
@@ -73,9 +73,14 @@ def test_variant_resumes(variant: str, metadata, tmp_path: Path) -> None:
     assert_resumes([BATCH[:12]] * 3, 1, metadata, tmp_path, **VARIANTS[variant])
 
 
-@pytest.mark.parametrize("at", [1, 2, 3])
-def test_resumes_while_episodes_are_still_joining(at: int, metadata, tmp_path: Path) -> None:
-    episodes = [[0, 3], [3, 0], [1], [1, 0], [5, 4]]
+@pytest.mark.parametrize("at", [1, 3, 4, 5])
+def test_resumes_while_episodes_are_still_joining(
+    at: int, metadata, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where an episode has joined and is not fitted yet: with these limits, the fit waits after the third batch."""
+    monkeypatch.setattr(fitting, "GROWTH", 1)
+    monkeypatch.setattr(fitting, "QUIET", 3)
+    episodes = [[0, 3], [3, 0], [1], [1, 0], [0], [0, 1], [5, 4]]
     batches = [torch.tensor([FRAMES * e + 7 * i for e in group for i in range(4)]) for group in episodes]
     assert_resumes(batches, at, metadata, tmp_path)
 

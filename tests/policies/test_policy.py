@@ -303,6 +303,19 @@ def test_padding_does_not_count(metadata) -> None:
     torch.testing.assert_close(policy.dynamics_loss(window), before)
 
 
+def test_planner_learns_from_histories_and_from_single_frames(metadata) -> None:
+    policy = build(metadata)
+    data, rows = demonstrations(policy), torch.tensor([0, 25, 205])
+    history, window = data.history(rows), data.window(rows, 0, 12)
+
+    def loss(states: torch.Tensor, labels: torch.Tensor) -> torch.Tensor:
+        logits, _ = policy.planner(policy.normalise(states), states)
+        return torch.nn.functional.cross_entropy(logits.flatten(0, 1), labels.flatten())
+
+    whole, alone = loss(history.state, history.primitive), loss(window.state[:, None], window.primitive[:, None])
+    torch.testing.assert_close(policy.planner_loss(history, window)[0], whole + alone)
+
+
 def test_planner_and_dynamics_share_no_parameter(metadata) -> None:
     policy = build(metadata)
     rows = torch.tensor([0])
