@@ -108,3 +108,6 @@ def test_a_quaternion_without_length_is_refused(side: str) -> None:
         check_action(action)
     action[quaternion] = [0.0, 0.0, 0.0, 1.1e-6]
     assert split_action(action)[side].pose.quaternion.tolist() == [0.0, 0.0, 0.0, 1.0]
+    for axis in range(4):
+        action[quaternion] = np.eye(4)[axis]
+        assert check_action(action)[quaternion].tolist() == np.eye(4)[axis].tolist()
