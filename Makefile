@@ -9,7 +9,7 @@ READY := $(VENV)/.ready
 DEMO := outputs/demo
 export HF_HUB_OFFLINE ?= 1
 
-.PHONY: help setup demo test test-long test-portable portability bench docs wheels lint types lock clean
+.PHONY: help setup demo test test-long test-portable portability mutants bench docs wheels lint types lock clean
 
 help: ## What there is to make
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
@@ -42,6 +42,9 @@ test-portable: $(READY) ## The tests that involve a policy, with other instructi
 
 portability: $(READY) ## What is the same, bit for bit, with other instruction sets and numbers of threads
 	$(BIN)/python scripts/portability.py
+
+mutants: $(READY) ## The share of small changes of the code that tests notice, in a fixed sample of 200
+	$(BIN)/python scripts/mutants.py
 
 bench: $(READY) ## Speeds, as ratios within one run
 	$(BIN)/hdril-bench
