@@ -143,7 +143,8 @@ def test_departure_is_found_in_frames_that_both_have() -> None:
 
 
 @pytest.mark.parametrize(
-    ("played", "name"), [(explanation(2), "lift"), (None, "move"), (explanation(-1, (0.0, 0.0, 0.0)), "move")]
+    ("played", "name"),
+    [(explanation(0), "grasp"), (explanation(2), "lift"), (None, "move"), (explanation(-1, (0.0, 0.0, 0.0)), "move")],
 )
 def test_departure_names_the_policys_primitive_or_else_the_experts(played: Any, name: str) -> None:
     assert score(moved(trace(explanations=[played] * 6), 3, BEYOND, 0)).departed_in == name
