@@ -22,7 +22,7 @@ class TrajectoryError:
     """:func:`dtw_distance` of the hands' positions, m."""
 
 
-def dtw_distance(path: NDArray[np.floating], reference: NDArray[np.floating]) -> float:
+def dtw_distance(path: NDArray[np.floating | np.integer], reference: NDArray[np.floating | np.integer]) -> float:
     """Mean distance along the optimal warping path of (T, D) and (T', D), in the unit of the arguments.
 
     D = 1 / |P*| sum_{(i, j) in P*} |x_i - y_j|, where P* is the warping path from (0, 0) to (T - 1, T' - 1) of least
