@@ -61,6 +61,14 @@ def test_seeds_of_another_task_are_others(tmp_path: Path) -> None:
     assert check_held_out(checkpoint, "peg_in_hole", [11]).known
     with pytest.raises(ValueError, match="were in the training data"):
         check_held_out(checkpoint, "peg_in_hole", [30])
+    with pytest.raises(ValueError, match=r"trained on the task peg_in_hole, table_lift, not on stacking$"):
+        check_held_out(checkpoint, "stacking", [99])
+
+
+def test_each_recipe_is_named_once(tmp_path: Path) -> None:
+    checkpoint = checkpoint_with(tmp_path / "c", LEARNED, LEARNED | {"recipe": "f" * 64}, LEARNED)
+    basis = check_held_out(checkpoint, "table_lift", [99]).basis
+    assert basis == f"compared with the seeds of the training data, recipes {'e' * 12}, {'f' * 12}"
 
 
 def test_hdril_refuses_training_seeds_from_any_folder(
@@ -126,3 +134,14 @@ def test_data_without_statistics_to_compare_are_not_taken_for_the_training_data(
     with pytest.raises(ValueError, match="the checkpoint's processors keep no statistics to compare"):
         check_held_out(checkpoint, "table_lift", [77], dataset)
     assert check_held_out(checkpoint, "table_lift", [77]).known is None
+
+
+def test_data_of_the_hub_are_looked_for_where_lerobot_keeps_them(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Training that was given no folder, but the name of a repository."""
+    monkeypatch.setattr("lerobot.utils.constants.HF_LEROBOT_HOME", tmp_path / "home")
+    checkpoint = find_checkpoint(str(save_act(tmp_path / "policy", dataset, None)))
+    assert check_held_out(checkpoint, "table_lift", [77]).known is None
+    shutil.copytree(dataset, tmp_path / "home/hdril/test")
+    assert check_held_out(checkpoint, "table_lift", [77]).known is True

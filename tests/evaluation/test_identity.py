@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import sys
 from dataclasses import replace
@@ -13,9 +14,10 @@ import pytest
 from hdril.cli.eval import EvalConfig, PolicySource, eval_command
 from hdril.evaluation.checkpoint import find_checkpoint, identify, resolve_config
 from hdril.evaluation.evaluate import Job, Worker, make_job
-from hdril.evaluation.identity import Identity, differences, identify_trials, require_same
+from hdril.evaluation.identity import Identity, differences, digest_json, identify_trials, require_same
 from hdril.evaluation.journal import Journal
 from hdril.evaluation.score import Outcome
+from hdril.evaluation.software import episode_software
 from hdril.evaluation.stored import read_evaluation
 from tests.evaluation.checkpoints import listing, save_replay
 
@@ -92,6 +94,16 @@ def test_task_is_compared_by_its_parameters() -> None:
     (line,) = differences(vars(default), vars(identify_trials("peg_in_hole:clearance=0.004", 0, 10)))
     assert line == "parameters clearance (0.005 there, 0.004 here)"
     assert differences(vars(default), vars(identify_trials("peg_in_hole", 1, 10))) == ["first seed (0 there, 1 here)"]
+
+
+def test_digest_of_json_is_that_of_its_canonical_form() -> None:
+    """Sorted keys and no spaces, whatever the order in which a dictionary was made."""
+    expected = hashlib.sha256(b'{"a":[1,2.5],"b":{"c":null,"d":true}}').hexdigest()
+    assert digest_json({"b": {"d": True, "c": None}, "a": [1, 2.5]}) == expected
+
+
+def test_a_task_of_this_package_has_no_source_of_its_own() -> None:
+    assert set(episode_software("table_lift")) == {"hdril", "pybullet", "numpy", "scipy", "robot model"}
 
 
 def test_digests_are_shown_short_and_missing_records_are_said() -> None:
@@ -245,6 +257,9 @@ def test_replaying_needs_the_evaluated_checkpoint(checkpoint: Path, tmp_path: Pa
     newer = replace(job.identity.policy, software=job.identity.policy.software | {"torch": "9"})
     (line,) = stored.changed_software(replace(job, identity=Identity(newer, job.identity.trials)))
     assert line.startswith("torch (")
+    stored.identity["policy"]["software"]["torch"] = "0"  # torch was updated since: it may be played again, and is told
+    assert stored.job() == job
+    assert stored.changed_software(job)[0].startswith("torch (0 there, ")
     overwrite(checkpoint)
     with pytest.raises(ValueError, match=r"other weights .* is no longer the one that was evaluated"):
         stored.job()
