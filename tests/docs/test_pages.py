@@ -27,7 +27,8 @@ ROOT = Path(__file__).parents[2]
 TRACKED = subprocess.run(
     ["git", "ls-files", "*.md"], cwd=ROOT, capture_output=True, text=True, check=True
 ).stdout.split()
-PAGES = [ROOT / page for page in TRACKED if (ROOT / page).exists()]
+# Reports that tests compare with are no pages.
+PAGES = [ROOT / page for page in TRACKED if not page.startswith("tests/") and (ROOT / page).exists()]
 COMMANDS = {
     "hdril-record": RecordConfig,
     "hdril-eval": EvalConfig,
