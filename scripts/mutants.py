@@ -1,7 +1,8 @@
-"""Mutation testing: change one line at a time in the code that makes published numbers, and count the changes that tests notice.
+"""Mutation testing: change one line at a time in the code that makes published numbers, and count what tests notice.
 
-python scripts/mutants.py                     a fixed sample of 200 mutants; writes docs/reference/mutants.md and docs/mutants.json
+python scripts/mutants.py                     a fixed sample of 200; writes docs/reference/mutants.md and docs/mutants.json
 python scripts/mutants.py --seed=1 --size=50  another sample, which is only printed
+python scripts/mutants.py --again             after tests were added: only the mutants of the last run that no test noticed
 
 The tool is mutmut; ``[tool.mutmut]`` in pyproject.toml says which files it changes and which tests it runs. mutmut wants all
 sources in one folder ``src``, and this repository has two: so it works on a copy, in ``outputs/mutants``. Each mutant runs the
@@ -30,6 +31,8 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCES = ("hdril", "policies/lerobot_policy_hdril/src/lerobot_policy_hdril")
 ALSO = ("tests", "configs", "pyproject.toml")
 """What the tests need beside the sources."""
+CLOCK = "minutes"
+"""A file in the copy: how long the runs on it have taken, minutes."""
 REPORT, RESULTS = ROOT / "docs/reference/mutants.md", ROOT / "docs/mutants.json"
 SEED, SIZE, REQUIRED = 11, 200, 0.85
 NOTICED = frozenset({"killed", "timeout", "segfault"})
@@ -66,6 +69,22 @@ def stage(folder: Path) -> None:
             shutil.copytree(ROOT / name, folder / name, ignore=without)
         else:
             shutil.copy2(ROOT / name, folder / name)
+
+
+def stage_tests(folder: Path) -> None:
+    """Bring the tests of a copy up to date.
+
+    Raises:
+        ValueError: the sources are not those of the copy, so what was found of them does not hold any more.
+    """
+    for source in SOURCES:
+        for file in sorted((ROOT / source).rglob("*.py")):
+            copy = folder / "src" / Path(source).name / file.relative_to(ROOT / source)
+            if not copy.is_file() or copy.read_bytes() != file.read_bytes():
+                raise ValueError(f"{file.relative_to(ROOT)} is not as it was in the last run; run all mutants")
+    for place in (folder / "tests", folder / "mutants/tests"):
+        shutil.rmtree(place, ignore_errors=True)
+    shutil.copytree(ROOT / "tests", folder / "tests", ignore=shutil.ignore_patterns("__pycache__"))
 
 
 def mutant_names(folder: Path) -> list[str]:
@@ -136,7 +155,10 @@ def by_module(mutants: list[Mutant]) -> str:
     """A Markdown table: module, mutants drawn, mutants noticed."""
     modules = sorted({mutant.module for mutant in mutants})
     groups = [[mutant for mutant in mutants if mutant.module == module] for module in modules]
-    rows = [(f"`{module}`", len(group), sum(m.noticed for m in group)) for module, group in zip(modules, groups, strict=True)]
+    rows = [
+        (f"`{module}`", len(group), sum(m.noticed for m in group))
+        for module, group in zip(modules, groups, strict=True)
+    ]
     return tabulate(rows, ("module", "drawn", "noticed"), tablefmt="github")
 
 
@@ -176,15 +198,25 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--size", type=int, default=SIZE, help="mutants to draw")
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--folder", type=Path, default=ROOT / "outputs/mutants", help="for the copy; it is deleted first")
+    parser.add_argument("--again", action="store_true", help="only those that no test noticed in the last run")
+    parser.add_argument(
+        "--folder", type=Path, default=ROOT / "outputs/mutants", help="for the copy; it is deleted first"
+    )
     options = parser.parse_args()
     began = time.monotonic()
-    stage(options.folder)
+    try:
+        stage_tests(options.folder) if options.again else stage(options.folder)
+    except ValueError as error:
+        sys.exit(f"mutants: {error}")
     names = mutant_names(options.folder)
     drawn = sorted(random.Random(options.seed).sample(names, options.size))
-    run_mutants(options.folder, drawn, options.processes)
+    left = [m.name for m in read_mutants(options.folder, drawn) if not m.noticed] if options.again else drawn
+    if left:
+        run_mutants(options.folder, left, options.processes)
     mutants = read_mutants(options.folder, drawn)
-    minutes = (time.monotonic() - began) / 60
+    clock = options.folder / CLOCK
+    minutes = (time.monotonic() - began) / 60 + (float(clock.read_text()) if options.again else 0.0)
+    clock.write_text(str(minutes))
     for mutant in mutants:
         if mutant.status != "killed":
             print(f"\n{mutant.name}: {mutant.status}\n{mutant.diff}")

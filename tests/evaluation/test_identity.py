@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import sys
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,8 +20,9 @@ from hdril.evaluation.evaluate import Job, Worker, make_job
 from hdril.evaluation.identity import Identity, differences, digest_json, identify_trials, require_same
 from hdril.evaluation.journal import Journal
 from hdril.evaluation.score import Outcome
-from hdril.evaluation.software import episode_software
+from hdril.evaluation.software import episode_software, evaluation_software
 from hdril.evaluation.stored import read_evaluation
+from hdril.tasks import TASKS
 from tests.evaluation.checkpoints import listing, save_replay
 
 SEED = 500_000
@@ -102,8 +106,23 @@ def test_digest_of_json_is_that_of_its_canonical_form() -> None:
     assert digest_json({"b": {"d": True, "c": None}, "a": [1, 2.5]}) == expected
 
 
-def test_a_task_of_this_package_has_no_source_of_its_own() -> None:
-    assert set(episode_software("table_lift")) == {"hdril", "pybullet", "numpy", "scipy", "robot model"}
+def test_software_is_what_is_installed() -> None:
+    """A task of this package has no source of its own: the digest behind hdril's version is of that, too."""
+    software = evaluation_software("table_lift")
+    packages = ("pybullet", "numpy", "scipy", "dtaidistance")
+    assert {name: software.pop(name) for name in packages} == {name: version(name) for name in packages}
+    assert set(software) == {"hdril", "robot model"}
+    assert re.fullmatch(rf"{re.escape(version('hdril'))} \([0-9a-f]{{12}}\)", software["hdril"])
+    robot = re.escape(f"baxter of example-robot-data {version('example-robot-data')}")
+    assert re.fullmatch(rf"{robot} \([0-9a-f]{{12}}\)", software["robot model"])
+
+
+def test_a_task_of_another_package_counts_by_its_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "stacking.py"
+    file.write_text("TASK = None")
+    monkeypatch.setattr(type(TASKS), "source", lambda self, name: SimpleNamespace(__name__=name, __file__=str(file)))
+    expected = hashlib.sha256(b"TASK = None").hexdigest()[:12]
+    assert episode_software("stacking")["source of stacking"] == expected
 
 
 def test_digests_are_shown_short_and_missing_records_are_said() -> None:
