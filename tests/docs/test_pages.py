@@ -24,11 +24,8 @@ from hdril.demonstrations.schema import features
 from hdril.simulation.actions import ACTION_NAMES
 
 ROOT = Path(__file__).parents[2]
-TRACKED = subprocess.run(
-    ["git", "ls-files", "*.md"], cwd=ROOT, capture_output=True, text=True, check=True
-).stdout.split()
-# Reports that tests compare with are no pages.
-PAGES = [ROOT / page for page in TRACKED if not page.startswith("tests/") and (ROOT / page).exists()]
+FOLDERS = ("docs", "datasets", "policies")
+PAGES = sorted([*ROOT.glob("*.md"), *(page for folder in FOLDERS for page in (ROOT / folder).rglob("*.md"))])
 COMMANDS = {
     "hdril-record": RecordConfig,
     "hdril-eval": EvalConfig,
