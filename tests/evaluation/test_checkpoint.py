@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from huggingface_hub.errors import LocalEntryNotFoundError
 from safetensors.torch import load_file, save_file
 
 from hdril.cli.eval import EvalConfig, PolicySource, eval_command, split_overrides
@@ -92,6 +93,31 @@ def test_options_of_training_cannot_change_an_evaluation(act: Path) -> None:
         resolve_config(find_checkpoint(str(act)), ("--optimizer_lr=1",))
     config = resolve_config(find_checkpoint(str(act)), ("--n_action_steps=3",))
     assert config.n_action_steps == 3  # pyright: ignore
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("policy", r"^no checkpoint at policy: it should be a folder with config\.json and model\.safetensors$"),
+        ("./policy", "^no checkpoint at policy: it should be a folder"),
+        ("../policy", r"^no checkpoint at \.\./policy: it should be a folder"),
+        ("runs/last/policy", "^no checkpoint at runs/last/policy: it should be a folder"),
+        ("/runs", "^no checkpoint at /runs: it should be a folder"),
+        ("some/policy", "^no checkpoint at some/policy, and the Hub cannot be asked for such a repository"),
+    ],
+)
+def test_a_checkpoint_that_is_not_there(name: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A name of two parts may be a repository of the Hub; any other is a folder."""
+    asked = []
+
+    def snapshot_download(repo_id: str, **_: object) -> str:
+        asked.append(repo_id)
+        raise LocalEntryNotFoundError("offline")
+
+    monkeypatch.setattr("huggingface_hub.snapshot_download", snapshot_download)
+    with pytest.raises(FileNotFoundError, match=message):
+        find_checkpoint(name)
+    assert asked == (["some/policy"] if name == "some/policy" else [])
 
 
 def test_unknown_types_of_policies_are_named(replay: Path) -> None:

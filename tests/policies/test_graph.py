@@ -53,6 +53,15 @@ def test_attention_is_a_distribution_over_named_nodes(kind: str) -> None:
     assert graph(state, state).shape == (5, graph.out_dim)
 
 
+def test_embedding_of_a_node_starts_with_variance_one_whatever_its_width() -> None:
+    """A projection of w columns has weights of variance 1 / w, so that normalised inputs of that many keep their scale."""
+    torch.manual_seed(0)
+    graph = ObjectAttention(NAMES, 2048)
+    width = max(len(indices) for indices in group_nodes(NAMES).values())
+    assert graph.embed.shape[1] == width == 8
+    assert graph.embed.std().item() == pytest.approx(width**-0.5, rel=0.05)
+
+
 @pytest.mark.parametrize("kind", INTERACTIONS)
 def test_samples_do_not_mix(kind: str) -> None:
     torch.manual_seed(0)
