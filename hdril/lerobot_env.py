@@ -96,10 +96,10 @@ def make_env(task: str, recordings: dict[str, str], **kwargs) -> gym.Env:
     """An environment that stops simulating once its episode is over, and writes Rerun recordings if it is asked to."""
     from lerobot.envs.utils import FreezeAfterEpisodeEnd
 
-    env: gym.Env = BimanualEnv(task, **kwargs)
-    if recordings["keep"] != "none":
-        # LeRobot imports this module at the start of each of its commands: Rerun is imported only if it is needed.
-        from hdril.viewer.recorded_environment import RecordedEpisodes
+    env = BimanualEnv(task, **kwargs)
+    if recordings["keep"] == "none":
+        return FreezeAfterEpisodeEnd(env)
+    # LeRobot imports this module at the start of each of its commands: Rerun is imported only if it is needed.
+    from hdril.viewer.recorded_environment import RecordedEpisodes
 
-        env = RecordedEpisodes(env, recordings["keep"], Path(recordings["folder"]))  # pyright: ignore
-    return FreezeAfterEpisodeEnd(env)
+    return FreezeAfterEpisodeEnd(RecordedEpisodes(env, recordings["keep"], Path(recordings["folder"])))

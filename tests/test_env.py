@@ -14,6 +14,7 @@ import hdril
 from hdril.actor import Decision, Observation
 from hdril.env import BimanualEnv
 from hdril.rollout import run_episode
+from hdril.simulation import world
 from hdril.simulation.robots import ROBOTS
 from hdril.tasks import TASKS, get_task
 from hdril.tasks.expert import ScriptedExpert
@@ -121,3 +122,19 @@ def test_an_action_that_is_not_finite_moves_nothing() -> None:
             env.step(np.full_like(observation["agent_pos"], np.nan))
         assert env.frame == 0
         np.testing.assert_array_equal(env.world.state_vector(), before)
+
+
+def test_closing_goes_on_after_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C while the simulator is given back: the command closes the environment again, and must end as interrupted."""
+    env = BimanualEnv("table_lift")
+    env.reset(seed=0)
+    disconnect = world.bullet.disconnect
+
+    def interrupted(client: int) -> None:
+        disconnect(client)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(world.bullet, "disconnect", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        env.close()
+    env.close()

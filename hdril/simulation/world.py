@@ -88,10 +88,10 @@ class World:
         return getattr(bullet, function)(*args, physicsClientId=self._client, **kwargs)
 
     def close(self) -> None:
-        """Give the client back. Calling it twice does no harm."""
-        if self._client >= 0:
-            bullet.disconnect(self._client)
-            self._client = -1
+        """Give the client back. Calling it twice does no harm, even if Ctrl-C came in the middle of the first call."""
+        client, self._client = self._client, -1
+        if client >= 0:
+            bullet.disconnect(client)
 
     # ------------------------------------------------------------------ building
 

@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
-from tests.cli.commands import call, succeed
+import pytest
+
+import hdril.cli.eval
+from tests.cli.commands import BIN, call, refuse, succeed
+from tests.evaluation.checkpoints import listing
 
 
 def test_hdril_evaluates_with_both_commands(checkpoint: Path, tmp_path: Path) -> None:
@@ -57,3 +66,68 @@ def test_an_action_that_is_not_finite_is_named(checkpoint: Path, tmp_path: Path)
     assert done.returncode == 2
     assert done.stderr.strip().splitlines()[-1] == "hdril-eval: error: the action is not finite: left_ee.x = nan"
     assert list(tmp_path.iterdir()) == [broken]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--policy.bogus=7"], "hdril has no option policy.bogus; it has: "),
+        (["--policy.rollout=backwards"], "argument policy.rollout: invalid choice: 'backwards'"),
+        (["--policy.hidden_dim=64"], "policy.hidden_dim is 128 in the checkpoint"),
+        (["--policy.repo_id=a/b"], "policy.repo_id cannot change an evaluation; what can: "),
+        (["--max_frames=69"], "max_frames must be at least 70, the horizon of table_lift"),
+        (["--seed=5"], "1 of 1 seeds (5 to 5) were in the training data"),
+        (["--task=peg_in_hole"], "the policy was trained on the task table_lift, not on peg_in_hole"),
+        (["--training_data=elsewhere"], "records what it was trained on: leave out training_data"),
+        (["--against=elsewhere"], "elsewhere holds no results.json"),
+    ],
+)
+def test_refusals_leave_nothing(
+    checkpoint: Path, tmp_path: Path, options: list[str], message: str, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    """The folder of the results and those above it are not made, either."""
+    given = ["--seed=200000", "--num_episodes=1", "--workers=1", *options]
+    output = f"--output_dir={tmp_path / 'new/folders/eval'}"
+    monkeypatch.setattr(sys, "argv", ["hdril-eval", f"--policy.path={checkpoint}", *given, output])
+    with pytest.raises(SystemExit) as caught:
+        hdril.cli.eval.main()
+    assert caught.value.code == 2
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    assert last.startswith("hdril-eval: error: ")
+    assert message in last
+    assert listing(tmp_path) == {}
+
+
+def test_a_truncated_checkpoint_is_one_line(checkpoint: Path, tmp_path: Path) -> None:
+    broken = Path(shutil.copytree(checkpoint, tmp_path / "broken"))
+    weights = broken / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-1])
+    message = refuse("hdril-eval", f"--policy.path={broken}", f"--output_dir={tmp_path / 'out'}")
+    assert message.startswith(f"{weights} is not a whole safetensors file: download or save it again")
+    assert list(tmp_path.iterdir()) == [broken]
+
+
+def test_ctrl_c_stops_and_the_same_command_goes_on(checkpoint: Path, tmp_path: Path) -> None:
+    command = ["hdril-eval", f"--policy.path={checkpoint}", "--seed=200000", "--num_episodes=6", "--workers=1",
+               "--rerun=none", f"--output_dir={tmp_path / 'eval'}"]  # fmt: skip
+    journal = tmp_path / "eval.partial/outcomes.jsonl"
+    process = subprocess.Popen([str(BIN / command[0]), *command[1:]], stderr=subprocess.DEVNULL, start_new_session=True)
+    deadline = time.monotonic() + 200
+    while not (journal.exists() and journal.read_text()) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(timeout=120) == 130
+    played = journal.read_text()
+    assert 1 <= len(played.splitlines()) < 6
+    succeed(*command)
+    results = json.loads((tmp_path / "eval/results.json").read_text())
+    assert [episode["seed"] for episode in results["per_episode"]] == list(range(200_000, 200_006))
+    assert results["per_episode"][0] == json.loads(played.splitlines()[0])
+    assert [path.name for path in tmp_path.iterdir()] == ["eval"]
+    assert not {"run.json", "outcomes.jsonl", "lock"} & {path.name for path in (tmp_path / "eval").iterdir()}
+
+
+def test_help_says_what_is_checked() -> None:
+    text = " ".join(succeed("hdril-eval", "--help").split())
+    for words in ("--max_frames", "--against", "--training_data", "Seeds that the policy was trained on are refused"):
+        assert words in text
