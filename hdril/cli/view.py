@@ -54,6 +54,8 @@ def _check(config: ViewConfig) -> None:
         raise ValueError("give either --run (an evaluation) or --dataset")
     if config.against is not None and (config.run is None or config.seed is None):
         raise ValueError("--against compares with --run on one seed: give --run and --seed")
+    if config.seed is not None and config.seed < 0:
+        raise ValueError(f"seed must be at least 0, got {config.seed}")
     if config.save is not None and config.save.exists():
         raise FileExistsError(f"{config.save} exists; choose another file or delete it")
     if config.save is not None and config.save.suffix != ".rrd":

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from multiprocessing import get_context
 
 from hdril.env import BimanualEnv
+from hdril.errors import UserError
 from hdril.evaluation.checkpoint import Checkpoint, find_checkpoint, identify, resolve_config
 from hdril.evaluation.identity import Identity, identify_trials
 from hdril.evaluation.lerobot_actor import LeRobotActor, foreign_primitives
@@ -146,5 +148,9 @@ def evaluate(job: Job, seeds: list[int], workers: int = 1, sink: EpisodeSink | N
         futures: list[Future[Outcome]] = [pool.submit(_work, job, seed, sink) for seed in seeds]
         for future in futures:
             yield future.result()
+    except BrokenProcessPool as error:
+        raise UserError(
+            f"a worker process was killed; {workers} workers may need more memory than there is: try fewer"
+        ) from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)

@@ -96,6 +96,9 @@ def _numbers(runs: list[list[int]]) -> Iterator[int]:
 
 def _from_dataset(checkpoint: Checkpoint, training_data: Path | None) -> tuple[list[TrainingSeeds], str]:
     """The seeds of the data set that the checkpoint was trained on, and why they are not known, if they are not."""
+    if base := checkpoint.read_config().get("pretrained_path"):
+        # LeRobot puts the statistics of the last data set in place of those of the first.
+        return [], f"training went on from {base}, and what that had been trained on is not recorded"
     if training_data is not None:
         if reason := _mismatch(checkpoint, training_data):
             raise ValueError(f"{training_data} is not the data set that {checkpoint.name} was trained on: {reason}")

@@ -45,8 +45,9 @@ class Journal:
             BusyError: another process writes here.
         """
         missing = [path for path in self.folder.parents if not path.exists()]
-        try:
-            with exclusively(self.folder, f"evaluating into {self.output}"):
+        # A process that is kept out must not remove what the other one writes: the cleaning is done under the lock.
+        with exclusively(self.folder, f"evaluating into {self.output}"):
+            try:
                 (self.folder / _RUN).write_text(json.dumps({"identity": self._identity.as_dict()}, indent=2))
                 with (self.folder / _OUTCOMES).open("a") as file:
 
@@ -56,10 +57,10 @@ class Journal:
                         self.done[outcome.seed] = outcome
 
                     yield add
-        except BaseException:
-            if not self.done:
-                self._remove(missing)
-            raise
+            except BaseException:
+                if not self.done:
+                    self._remove(missing)
+                raise
 
     def _remove(self, made: list[Path]) -> None:
         shutil.rmtree(self.folder, ignore_errors=True)

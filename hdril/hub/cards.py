@@ -181,12 +181,13 @@ def with_evaluation(card: ModelCard, summary: dict[str, Any], repo_id: str) -> M
     after = rest[cut:] if heading and cut >= 0 else "\n"
     text = f"{before.rstrip()}\n\n{EVALUATION}\n\n{evaluation_section(summary, repo_id)}{after}"
     result = EvalResult(
-        task_type="robotics", dataset_type="hdril", dataset_name=summary["task"], metric_type="success_rate",
+        task_type="robotics", dataset_type="hdril", dataset_name=summary["task"],
+        dataset_config=summary["task"], metric_type="success_rate",
         metric_name="success rate, %", metric_value=round(summary["pc_success"], 2),
     )  # fmt: skip
     data: Any = card.data  # its fields are those of a model's card
     data.model_name = data.model_name or repo_id.split("/")[-1]
-    others = [r for r in data.eval_results or [] if r.dataset_name != summary["task"]]
+    others = [r for r in data.eval_results or [] if r.dataset_config != summary["task"]]
     data.eval_results = [*others, result]
     return ModelCard(f"---\n{data.to_yaml()}\n---\n{text}")
 

@@ -145,3 +145,14 @@ def test_data_of_the_hub_are_looked_for_where_lerobot_keeps_them(
     assert check_held_out(checkpoint, "table_lift", [77]).known is None
     shutil.copytree(dataset, tmp_path / "home/hdril/test")
     assert check_held_out(checkpoint, "table_lift", [77]).known is True
+
+
+def test_what_was_fine_tuned_is_not_known(dataset: Path, tmp_path: Path) -> None:
+    """LeRobot overwrites the statistics of the first training: those of the last say nothing of its seeds."""
+    folder = save_act(tmp_path / "policy", dataset, str(dataset))
+    assert check_held_out(find_checkpoint(str(folder)), "table_lift", [500]).known is True
+    config = json.loads((folder / "config.json").read_text()) | {"pretrained_path": "user/base"}
+    (folder / "config.json").write_text(json.dumps(config))
+    held_out = check_held_out(find_checkpoint(str(folder)), "table_lift", [500], dataset)
+    assert held_out.known is None
+    assert held_out.basis.startswith("training went on from user/base")

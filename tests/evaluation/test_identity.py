@@ -187,12 +187,12 @@ def test_only_one_process_writes(checkpoint: Path, tmp_path: Path) -> None:
 
     identity = job_of(checkpoint).identity
     with Journal(tmp_path / "eval", identity).writing() as add:
-        add(outcome(SEED))
-        with (
+        with (  # before there is an outcome: what the first has begun must stay
             pytest.raises(BusyError, match="another process is evaluating into"),
             Journal(tmp_path / "eval", identity).writing(),
         ):
             pass
+        add(outcome(SEED))
     assert Journal(tmp_path / "eval", identity).done
 
 

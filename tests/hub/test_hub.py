@@ -185,6 +185,25 @@ def test_card_without_a_place_for_results_gets_one() -> None:
     assert "weights with the SHA-256 `aaaaaaaaaaaa…`, on cpu, with torch 2." in card.text
 
 
+def test_card_keeps_the_rates_of_each_task_apart() -> None:
+    summary = {
+        "overrides": [], "n_success": 3, "n_episodes": 4, "pc_success_ci95": [30.0, 95.0], "first_seed": 9,
+        "held_out": None, "held_out_basis": "the training data have no record of seeds", "max_frames": 0,
+        "identity": {"policy": {"weights": "a" * 64, "device": "cpu", "software": {}}, "trials": {"software": {}}},
+        **{key: {"mean": 1.0, "std": 0.0} for key in ("position_error_cm", "angle_error_rad", "dtw_cm")},
+    }  # fmt: skip
+    card = ModelCard("---\nmodel_name: x\n---\n# ACT\n")
+    for task, rate in (
+        ("peg_in_hole", 100.0),
+        ("peg_in_hole:clearance=0.004", 12.0),
+        ("peg_in_hole:clearance=0.004", 13.0),
+    ):
+        card = ModelCard(str(with_evaluation(card, summary | {"task": task, "pc_success": rate}, "user/act")))
+    rates = {result.dataset_name: result.metric_value for result in card.data.eval_results}
+    assert rates == {"peg_in_hole": 100.0, "peg_in_hole:clearance=0.004": 13.0}
+    assert len(card.data.eval_results) == 2
+
+
 # ---------------------------------------------------------------------- faults
 
 FILES: dict[str, Path | bytes] = {"a.txt": b"one", "b/c.txt": b"two"}
