@@ -18,6 +18,7 @@ from tests.cli.commands import BIN, call, refuse, succeed
 from tests.evaluation.checkpoints import listing
 
 
+@pytest.mark.portable
 def test_hdril_evaluates_with_both_commands(checkpoint: Path, tmp_path: Path) -> None:
     succeed(
         "lerobot-eval", f"--policy.path={checkpoint}", "--env.type=hdril", "--env.task=table_lift",

@@ -5,12 +5,14 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import pytest
 from safetensors.torch import load_file, save_file
 
 from tests.cli.commands import refuse, succeed
 from tests.evaluation.checkpoints import listing
 
 
+@pytest.mark.portable
 def test_replay_and_comparison_are_of_the_evaluated_weights(checkpoint: Path, tmp_path: Path) -> None:
     """A seed is played again with the weights that were evaluated, and with no others."""
     last = Path(shutil.copytree(checkpoint, tmp_path / "last"))

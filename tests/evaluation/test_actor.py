@@ -64,6 +64,7 @@ def test_primitives_that_are_not_the_tasks_are_no_label(tmp_path: Path) -> None:
     assert foreign_primitives(find_checkpoint(str(tmp_path / "p")), TASK) == ("juggle",)
 
 
+@pytest.mark.portable
 def test_hdril_explains_itself(dataset: Path, tmp_path: Path) -> None:
     actor = LeRobotActor(str(save_hdril(tmp_path / "p", dataset)), TASK)
     actor.reset(0)

@@ -24,10 +24,14 @@ from safetensors.torch import load_file, save_file
 import hdril.hub.publish
 from hdril.cli.eval import EvalConfig, PolicySource, eval_command
 from hdril.cli.record import RecordConfig, record_command
+from hdril.evaluation.checkpoint import Checkpoint
 from hdril.evaluation.evaluate import Worker, make_job
+from hdril.evaluation.stored import read_evaluation
 from hdril.hub.cards import with_evaluation
+from hdril.hub.evaluations import publish_evaluation
 from hdril.hub.publish import HubError, publish
 from tests.evaluation.checkpoints import save_hdril
+from tests.evaluation.test_identity import finish
 from tests.hub.fake_hub import FakeHub
 
 TOKEN = "hf_" + "a" * 34
@@ -97,6 +101,7 @@ def test_another_dataset_than_asked_for_is_not_pushed(hub: FakeHub, dataset: Pat
     assert not hub.requests
 
 
+@pytest.mark.portable
 def test_pushed_policy_is_loaded_and_evaluated_from_the_hub(
     hub: FakeHub, checkpoint: Path, tmp_path: Path, dataset: Path
 ) -> None:
@@ -168,6 +173,22 @@ def test_results_of_other_weights_are_not_published(hub: FakeHub, checkpoint: Pa
     ):
         eval_command(replace(config, push="user/local"))
     assert not hub.repositories
+
+
+def test_results_do_not_go_into_the_card_of_other_weights(hub: FakeHub, checkpoint: Path, tmp_path: Path) -> None:
+    """A policy of the Hub has no files here that could go along: the repository must hold the same weights, or none."""
+    job = make_job("table_lift", Checkpoint("user/lifter", checkpoint), 700_003, 1)
+    evaluation = read_evaluation(finish(job, tmp_path / "eval"))
+    publish("user/other", "model", {"model.safetensors": b"of another policy"}, "message", private=True)
+    with pytest.raises(ValueError, match=r"user/other holds other weights \(\w{12} there, \w{12} evaluated\)"):
+        publish_evaluation("user/other", job, evaluation, private=True)
+    assert set(hub.repositories["model", "user/other"].files) == {"model.safetensors"}
+    publish("user/other", "model", {"model.safetensors": checkpoint / "model.safetensors"}, "message", private=True)
+    publish_evaluation("user/other", job, evaluation, private=True)
+    card = hub.repositories["model", "user/other"].files["README.md"].decode()
+    assert f"weights with the SHA-256 `{job.identity.policy.weights[:12]}…`" in card
+    assert "pybullet" in card
+    assert "Whether the seeds are held out is not known: it is a test." in card
 
 
 def test_card_without_a_place_for_results_gets_one() -> None:

@@ -52,6 +52,7 @@ def outcome(run: Path) -> dict:
     return json.loads((run / "results.json").read_text())["per_episode"][0]
 
 
+@pytest.mark.portable
 def test_recording_of_a_damaged_policy_names_the_primitive_that_failed(runs: dict[str, Path]) -> None:
     """The policy that stops moving in lift fails, and everything that tells why points at that primitive."""
     assert outcome(runs["whole"])["success"]
@@ -71,6 +72,7 @@ def test_recording_of_a_damaged_policy_names_the_primitive_that_failed(runs: dic
     assert "lift (1)" in (runs["damaged"] / "report.md").read_text()
 
 
+@pytest.mark.portable
 def test_damage_is_to_one_primitive(dataset: Path, tmp_path: Path) -> None:
     whole = save_hdril(tmp_path / "whole", dataset)
     done = run_script("damage.py", whole, tmp_path / "damaged", "lift")
