@@ -144,6 +144,7 @@ def test_a_worker_plays_a_seed_as_the_evaluation_did(expert: Trace, cache: Path,
     episode = worker.play(SEED)
     worker.env.close()
     assert episode.identity == job.identity
+    assert episode.env is worker.env  # its world is that of the last frame: recordings take the robot from it
     assert episode.outcome.success
     assert episode.outcome.position_error_cm == 0.0
     np.testing.assert_array_equal(episode.trace.state, expert.state)

@@ -189,6 +189,21 @@ def test_fit_follows_when_a_tenth_is_new_or_no_more_come() -> None:
     assert learned.records()[0].fitted == 56
 
 
+def test_the_last_episode_of_all_is_fitted_too() -> None:
+    """It is no tenth of the others, and no batch after it brings another one."""
+    learned = a_hundred_episodes([])
+    learned.join(torch.arange(99))
+    learned.mark_fitted()
+    learned.join(torch.tensor([99]))
+    for _ in range(QUIET):
+        assert not learned.fit_is_due()
+        assert learned.join(torch.tensor([0]))
+    assert learned.fit_is_due()
+    learned.mark_fitted()
+    assert not learned.join(torch.tensor([0]))
+    assert learned.records()[0].fitted == 100
+
+
 def test_record_of_what_was_learned(metadata, tmp_path: Path) -> None:
     policy = build(metadata, learned=False)
     policy.forward({"index": torch.tensor([0, FRAMES, 4 * FRAMES])})

@@ -182,6 +182,31 @@ def test_object_attention_is_torch_geometrics_message_passing() -> None:
             torch.testing.assert_close(out.flatten(), mine[i], atol=1e-5, rtol=1e-5)
 
 
+def test_nodes_without_a_pose_have_no_edges() -> None:
+    """A node of one number, say the state of a switch, beside hands with poses."""
+    names = [*ACTION_NAMES, "switch.state"]
+    graph = ObjectAttention(names, 8)
+    assert graph.node_names == ["left", "right", "switch"]
+    assert graph.edges.tolist() == [[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]
+    state = torch.cat([states(4)[:, :16], torch.ones(4, 1)], dim=-1)
+    relations = graph._relations(state)
+    assert (relations[:, 2] == 0.0).all()
+    assert (relations[:, :, 2] == 0.0).all()
+    assert relations[:, 0, 1].abs().min() > 0.0
+    assert graph(state, state).isfinite().all()
+
+
+def test_object_attention_has_the_parameters_of_its_equation() -> None:
+    """Projections, W, M, a and E: none has a bias."""
+    shapes = {name: tuple(p.shape) for name, p in ObjectAttention(NAMES, 16).named_parameters()}
+    assert shapes == {
+        "embed": (3, 8, 16), "identity": (3, 16), "message.weight": (16, 16), "edge_message.weight": (16, 7),
+        "score.weight": (2, 16), "edge_score.weight": (1, 7),
+    }  # fmt: skip
+    shapes = {name: tuple(p.shape) for name, p in ScalarAttention(NAMES, 16).named_parameters()}
+    assert shapes == {"project.weight": (16, 1), "score.weight": (2, 16)}
+
+
 def test_relational_coordinates_are_poses_in_the_objects_frame() -> None:
     frame = RelationalCoordinates(NAMES, NAMES[16:], [*ACTION_NAMES, *NAMES])
     state = states(4)

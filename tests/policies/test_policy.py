@@ -133,6 +133,22 @@ def test_stacked_models_are_the_separate_ones(preset: str, metadata) -> None:
         torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
 
 
+def test_a_window_has_the_numbers_of_its_steps(metadata) -> None:
+    """The first is how many frames of the primitive are over; beyond the room of a plan the last number is repeated."""
+    policy = build(metadata)
+    assert policy.capacity == 12
+    assert policy.steps(torch.tensor([0, 9])).tolist() == [[*range(12)], [9, 10, *[11] * 10]]
+
+
+def test_latent_sees_the_numbers_of_objects_alone(metadata) -> None:
+    """The paper's skip connection (Figure 2) passes the objects' poses round the encoder, and not the hands'."""
+    with_skip, without = (build(metadata, learned=False, preset=preset) for preset in ("res", "gru_gru"))
+    names = [*with_skip.config.state_names, *with_skip.config.environment_names]
+    seen = [names[column] for column in with_skip.model_of(0).skip_columns]
+    assert seen == with_skip.config.environment_names
+    assert len(without.model_of(0).skip_columns) == 0
+
+
 def test_linear_maps_are_the_ridge_solution(metadata) -> None:
     """Without a penalty to speak of, they fit a linear relation exactly, from every frame at which a window starts."""
     policy = build(metadata, replan_every=5)
