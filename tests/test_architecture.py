@@ -13,7 +13,7 @@ import hdril
 PACKAGE = Path(hdril.__file__).parent
 POLICY = PACKAGE.parent / "policies" / "lerobot_policy_hdril" / "src" / "lerobot_policy_hdril"
 
-BOTTOM = {"errors", "files", "geometry", "markdown", "plugins"}
+BOTTOM = {"errors", "files", "geometry", "markdown", "plugins", "workers"}
 """Modules that know nothing of robots and tasks. Every room may import them, and they import only one another."""
 
 BELOW: dict[str, set[str]] = {name: set() for name in BOTTOM} | {
@@ -79,6 +79,13 @@ def test_a_module_imports_only_what_is_below_it(room: str, file: Path) -> None:
 def test_only_the_world_imports_pybullet(room: str, file: Path) -> None:
     uses = {name for name in imports(file) if name.split(".")[0] in ("pybullet", "pybullet_data", "pybullet_utils")}
     assert not uses or file == PACKAGE / "simulation" / "world.py"
+
+
+@SOURCES
+def test_processes_are_started_in_one_place(room: str, file: Path) -> None:
+    """Pools of their own would leave their workers behind when a command is killed."""
+    pools = {name for name in imports(file) if name.split(".")[0] == "multiprocessing" or "ProcessPool" in name}
+    assert not pools or room == "workers"
 
 
 def test_the_package_itself_imports_tasks_alone() -> None:

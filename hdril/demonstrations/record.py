@@ -5,12 +5,10 @@ from __future__ import annotations
 import shutil
 from collections import deque
 from collections.abc import Callable, Generator, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Future
 from contextlib import closing
 from functools import cache
 from itertools import islice
-from multiprocessing import get_context
 from pathlib import Path
 
 from hdril.demonstrations.episode import Episode, demonstrate
@@ -21,6 +19,7 @@ from hdril.env import BimanualEnv
 from hdril.errors import UserError
 from hdril.files import MAX_SEED, exclusively
 from hdril.tasks.expert import ScriptedExpert
+from hdril.workers import worker_pool
 
 PATIENCE = 20
 """How many more demonstrations may fail than succeed before a recording is given up."""
@@ -60,24 +59,16 @@ def episodes(recipe: Recipe, first_seed: int, workers: int = 1) -> Generator[Epi
 
 
 def _in_parallel(recipe: Recipe, seeds: Iterator[int], workers: int) -> Generator[Episode]:
-    # Workers that are forked from this process would inherit its threads' locks.
-    pool = ProcessPoolExecutor(workers, get_context("forkserver"))
     pending: deque[Future[Episode]] = deque()
+    with worker_pool(workers) as pool:
 
-    def submit(count: int) -> None:
-        pending.extend(pool.submit(_work, recipe, seed) for seed in islice(seeds, count))
+        def submit(count: int) -> None:
+            pending.extend(pool.submit(_work, recipe, seed) for seed in islice(seeds, count))
 
-    try:
         submit(2 * workers)
         while pending:
             yield pending.popleft().result()
             submit(1)
-    except BrokenProcessPool as error:
-        raise UserError(
-            f"a worker process was killed; {workers} workers may need more memory than there is: try fewer"
-        ) from error
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def record(

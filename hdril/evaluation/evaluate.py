@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Future
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from multiprocessing import get_context
 
 from hdril.env import BimanualEnv
-from hdril.errors import UserError
 from hdril.evaluation.checkpoint import Checkpoint, find_checkpoint, identify, resolve_config
 from hdril.evaluation.identity import Identity, identify_trials
 from hdril.evaluation.lerobot_actor import LeRobotActor, foreign_primitives
 from hdril.evaluation.reference import Reference, ReferenceCache
 from hdril.evaluation.score import Outcome, score_episode
 from hdril.trace import Trace, trace_episode
+from hdril.workers import worker_pool
 
 
 @dataclass(frozen=True)
@@ -143,14 +141,7 @@ def evaluate(job: Job, seeds: list[int], workers: int = 1, sink: EpisodeSink | N
         with closing(worker.env):
             yield from (_finish(worker.play(seed), sink) for seed in seeds)
         return
-    pool = ProcessPoolExecutor(workers, get_context("forkserver"))
-    try:
+    with worker_pool(workers) as pool:
         futures: list[Future[Outcome]] = [pool.submit(_work, job, seed, sink) for seed in seeds]
         for future in futures:
             yield future.result()
-    except BrokenProcessPool as error:
-        raise UserError(
-            f"a worker process was killed; {workers} workers may need more memory than there is: try fewer"
-        ) from error
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
