@@ -11,6 +11,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from hdril import __version__
 from hdril.cli.common import check_repo_id, run
 from hdril.demonstrations.provenance import Recipe, read_provenance
 from hdril.demonstrations.record import record
@@ -97,11 +98,16 @@ def _record(recipe: Recipe, config: RecordConfig, root: Path) -> None:
 
 
 def _check_same(root: Path, recipe: Recipe, config: RecordConfig) -> None:
-    """Raises FileExistsError unless the dataset at ``root`` is what the options ask for."""
+    """Raises FileExistsError unless the dataset at ``root`` is what this hdril makes of the options."""
     provenance = read_provenance(root)
     asked = (recipe, config.num_episodes, config.seed)
     if provenance is None or asked != (provenance.recipe, len(provenance.seeds), provenance.first_seed):
         raise FileExistsError(f"{root} exists and holds something else; choose another root or delete it")
+    if provenance.hdril_version != __version__:
+        raise FileExistsError(
+            f"{root} exists and was recorded by hdril {provenance.hdril_version}, not by {__version__}; "
+            "choose another root or delete it"
+        )
 
 
 def _push(repo_id: str, config: RecordConfig, root: Path) -> None:

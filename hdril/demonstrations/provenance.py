@@ -43,7 +43,7 @@ class Recipe:
         if self.physics is None:
             object.__setattr__(self, "physics", task.physics)
 
-    def as_dict(self, hdril_version: str = __version__) -> dict[str, Any]:
+    def as_dict(self, hdril_version: str) -> dict[str, Any]:
         """The recipe and the version of hdril that plays it, for JSON."""
         return asdict(self) | {"hdril_version": hdril_version}
 
@@ -76,19 +76,24 @@ class Provenance:
         return min((*self.seeds, *self.dropped))
 
     @property
+    def recipe_values(self) -> dict[str, Any]:
+        """The key ``recipe`` of ``meta/hdril.json``: the recipe, and the version of hdril that recorded."""
+        return self.recipe.as_dict(self.hdril_version)
+
+    @property
     def recipe_digest(self) -> str:
-        """SHA-256, in hexadecimal, of the key ``recipe`` of ``meta/hdril.json``, as canonical JSON (sorted keys, no spaces).
+        """SHA-256, in hexadecimal, of :attr:`recipe_values` as canonical JSON (sorted keys, no spaces).
 
         Datasets with the same digest hold the same episode for the same seed.
         """
-        text = json.dumps(self.recipe.as_dict(self.hdril_version), sort_keys=True, separators=(",", ":"))
+        text = json.dumps(self.recipe_values, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
 
 
 def write_provenance(root: Path, provenance: Provenance) -> None:
     """Write ``meta/hdril.json``."""
     values = {
-        "recipe": provenance.recipe.as_dict(provenance.hdril_version),
+        "recipe": provenance.recipe_values,
         "seeds": list(provenance.seeds),
         "dropped": {str(seed): why for seed, why in provenance.dropped.items()},
     }

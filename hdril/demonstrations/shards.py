@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hdril import __version__
 from hdril.demonstrations.episode import Episode
 from hdril.demonstrations.provenance import Recipe
 from hdril.files import write_atomically
@@ -20,12 +21,12 @@ class Shards:
     """Episodes of an unfinished recording, a file each, so that an interrupted one can go on where it was.
 
     Raises:
-        ValueError: the folder holds episodes of another recipe or first seed.
+        ValueError: the folder holds episodes of another recipe, version of hdril or first seed.
     """
 
     def __init__(self, folder: Path, recipe: Recipe, first_seed: int) -> None:
         self._folder, self._first_seed = folder, first_seed
-        plan = json.dumps(recipe.as_dict() | {"first_seed": first_seed}, indent=2)
+        plan = json.dumps(recipe.as_dict(__version__) | {"first_seed": first_seed}, indent=2)
         plan_file = folder / "plan.json"
         if plan_file.exists() and plan_file.read_text() != plan:
             raise ValueError(f"{folder} holds episodes of another recipe; delete it or choose another root")

@@ -37,11 +37,11 @@ def dataset_card(repo_id: str, root: Path) -> str:
     metadata = LeRobotDatasetMetadata(repo_id, root=root)
     task, recipe = get_task(provenance.recipe.task), provenance.recipe
     noise = " ".join(f"--noise.{name}={value}" for name, value in asdict(recipe.noise).items())
-    dropped = json.loads((root / RECIPE_PATH).read_text())["dropped"]
+    dropped = len(provenance.dropped)
     description = f"""Scripted demonstrations of the task `{recipe.task}` ({task.description}) with two arms of a simulated
 {recipe.robot.capitalize()}: {metadata.total_episodes} episodes, {metadata.total_frames} frames at {metadata.fps} Hz, each
-frame labelled with its movement primitive. All episodes succeed; {len(dropped)} of
-{metadata.total_episodes + len(dropped)} that were tried failed and were dropped."""
+frame labelled with its movement primitive. All episodes succeed; {dropped} of
+{metadata.total_episodes + dropped} that were tried failed and were dropped."""
     card = create_lerobot_dataset_card(
         tags=[*TAGS, base_name(recipe.task)],
         dataset_info=metadata.info,
@@ -88,7 +88,7 @@ Each episode can be made again from its seed ({min(provenance.seeds)} to {max(pr
 `meta/episodes`) and this recipe, which is also `{RECIPE_PATH}`.
 
 ```json
-{json.dumps(recipe.as_dict(), indent=2)}
+{json.dumps(provenance.recipe_values, indent=2)}
 ```
 
 ## Use

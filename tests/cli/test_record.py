@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
+from hdril import __version__
 from hdril.cli.record import RecordConfig, default_root, record_command
 from hdril.demonstrations.provenance import Provenance, Recipe, read_provenance
 from hdril.demonstrations.write import write_dataset
@@ -70,7 +73,17 @@ def test_a_dataset_whose_first_seed_was_dropped_is_known_again(made_up, pushed: 
     record_command(RecordConfig("user/name", num_episodes=2, seed=5, root=root, push=True))
     assert pushed == ["user/name"]
     for other in ({"seed": 6}, {"num_episodes": 3}, {"task": "peg_in_hole"}):
-        options = {"num_episodes": 2, "seed": 5} | other
+        options: dict[str, Any] = {"num_episodes": 2, "seed": 5} | other
         with pytest.raises(FileExistsError, match="holds something else"):
             record_command(RecordConfig("user/name", root=root, push=True, **options))
     assert pushed == ["user/name"]
+
+
+def test_a_dataset_of_another_version_is_not_published_as_made_by_this_one(
+    made_up, pushed: list[str], tmp_path: Path
+) -> None:
+    root = tmp_path / "set"
+    write_dataset(root, Provenance(Recipe("table_lift"), (5,), hdril_version="0.0.9"), [made_up(5)])
+    with pytest.raises(FileExistsError, match=rf"was recorded by hdril 0\.0\.9, not by {re.escape(__version__)}"):
+        record_command(RecordConfig("user/name", num_episodes=1, seed=5, root=root, push=True))
+    assert pushed == []

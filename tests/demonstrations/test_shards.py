@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import hdril.demonstrations.shards
 from hdril.demonstrations.episode import Episode
 from hdril.demonstrations.provenance import Recipe
 from hdril.demonstrations.shards import Shards
@@ -83,7 +84,7 @@ def test_another_plan_is_refused_and_changes_nothing(made_up, tmp_path: Path, mo
     with pytest.raises(ValueError, match="another recipe"):
         Shards(tmp_path, replace(RECIPE, noise=Noise(0.0)), 0)
     with monkeypatch.context() as patch:
-        patch.setattr(Recipe.as_dict, "__defaults__", ("another version",))
+        patch.setattr(hdril.demonstrations.shards, "__version__", "0.0.9")
         with pytest.raises(ValueError, match="another recipe"):
             Shards(tmp_path, RECIPE, 0)
     assert (tmp_path / "plan.json").read_text() == plan
