@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -46,11 +46,6 @@ class Recipe:
     def as_dict(self, hdril_version: str) -> dict[str, Any]:
         """The recipe and the version of hdril that plays it, for JSON."""
         return asdict(self) | {"hdril_version": hdril_version}
-
-    @staticmethod
-    def from_dict(values: dict[str, Any]) -> Recipe:
-        """The inverse of :meth:`as_dict`, but for the version."""
-        return Recipe(values["task"], Noise(**values["noise"]), Physics(**values["physics"]), values["robot"])
 
     def make_env(self) -> BimanualEnv:
         """The environment in which the expert demonstrates."""
@@ -101,14 +96,62 @@ def write_provenance(root: Path, provenance: Provenance) -> None:
 
 
 def read_provenance(root: Path) -> Provenance | None:
-    """How a dataset was made; None for a dataset that hdril did not record."""
-    with suppress(FileNotFoundError):
-        values = json.loads((root / RECIPE_PATH).read_text())
-        recipe, dropped = values["recipe"], values["dropped"]
-        return Provenance(
-            Recipe.from_dict(recipe),
-            tuple(values["seeds"]),
-            {int(seed): why for seed, why in dropped.items()},
-            recipe["hdril_version"],
-        )
-    return None
+    """How a dataset was made; None for a dataset that hdril did not record.
+
+    Raises:
+        ValueError: ``meta/hdril.json`` is damaged, or another version of hdril wrote it; names the file and the field.
+    """
+    path = root / RECIPE_PATH
+    try:
+        text = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    try:
+        return _provenance(json.loads(text))
+    except ValueError as error:  # of which JSONDecodeError and UnicodeDecodeError are kinds
+        raise ValueError(f"hdril {__version__} cannot read {path}: {error}") from error
+
+
+def _provenance(values: object) -> Provenance:
+    told = _named(values, "", ("recipe", "seeds", "dropped"))
+    recipe = _named(told["recipe"], "recipe", (*(entry.name for entry in fields(Recipe)), "hdril_version"))
+    seeds, dropped = told["seeds"], told["dropped"]
+    if not isinstance(seeds, list) or not seeds or not all(type(seed) is int for seed in seeds):
+        raise ValueError("seeds must be a list of integers, with one at least")
+    if not isinstance(dropped, dict) or not all(seed.isdecimal() and type(why) is str for seed, why in dropped.items()):
+        raise ValueError("dropped must be an object of texts by seed")
+    for name in ("task", "robot", "hdril_version"):
+        _check_type(recipe[name], "", f"recipe.{name}")
+    made = Recipe(
+        task=recipe["task"],
+        noise=_settings(Noise, recipe["noise"], "recipe.noise"),
+        physics=_settings(Physics, recipe["physics"], "recipe.physics"),
+        robot=recipe["robot"],
+    )
+    return Provenance(made, tuple(seeds), {int(seed): why for seed, why in dropped.items()}, recipe["hdril_version"])
+
+
+def _named(values: object, where: str, names: Iterable[str]) -> dict[str, Any]:
+    """An object of JSON that has the fields ``names`` and no others: a field that is not known may change what was made."""
+    if not isinstance(values, dict):
+        raise ValueError(f"{where or 'it'} must be an object, not {type(values).__name__}")
+    prefix, names = where and f"{where}.", tuple(names)
+    if missing := [name for name in names if name not in values]:
+        raise ValueError(f"it has no field {prefix}{missing[0]}")
+    if unknown := [name for name in values if name not in names]:
+        raise ValueError(f"it has an unknown field {prefix}{unknown[0]}; known are: {', '.join(names)}")
+    return values
+
+
+def _settings[T: (Noise, Physics)](kind: type[T], values: object, where: str) -> T:
+    """Settings of which each is of the type of its default."""
+    told, default = _named(values, where, (entry.name for entry in fields(kind))), kind()
+    for name, value in told.items():
+        _check_type(value, getattr(default, name), f"{where}.{name}")
+    return kind(**told)
+
+
+def _check_type(value: object, like: object, where: str) -> None:
+    """Raises ValueError unless ``value`` is of the same type as ``like``; an integer is a float, too."""
+    if type(value) is not type(like) and not (type(like) is float and type(value) is int):
+        raise ValueError(f"{where} must be of type {type(like).__name__}, got {value!r}")

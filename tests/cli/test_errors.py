@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -11,8 +12,11 @@ from pathlib import Path
 import draccus
 import pytest
 
+from hdril import __version__
 from hdril.cli.common import check_repo_id, run
+from hdril.demonstrations.provenance import RECIPE_PATH, Provenance, Recipe
 from hdril.demonstrations.record import ExpertError
+from hdril.demonstrations.write import write_dataset
 from hdril.errors import UserError
 from hdril.files import BusyError
 from hdril.hub.publish import HubError
@@ -178,3 +182,15 @@ def test_help(command: str, option: str) -> None:
     text = succeed(command, "--help")
     assert option in text
     assert "Traceback" not in text
+
+
+def test_provenance_that_cannot_be_read_is_one_line(made_up, tmp_path: Path) -> None:
+    root = tmp_path / "set"
+    write_dataset(root, Provenance(Recipe("table_lift"), (0,)), [made_up(0)])
+    path = root / RECIPE_PATH
+    path.write_text(json.dumps({key: value for key, value in json.loads(path.read_text()).items() if key != "dropped"}))
+    expected = f"hdril {__version__} cannot read {path}: it has no field dropped"
+    options = [f"--root={root}", "--repo_id=user/name", "--num_episodes=1", "--push=true"]
+    assert refuse("hdril-record", *options) == expected
+    assert refuse("hdril-view", f"--dataset={root}", f"--save={tmp_path / 'x.rrd'}") == expected
+    assert list(tmp_path.iterdir()) == [root]

@@ -12,7 +12,7 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 
 from hdril.demonstrations.episode import Episode
-from hdril.demonstrations.provenance import Provenance, Recipe, read_provenance
+from hdril.demonstrations.provenance import Provenance, Recipe
 from hdril.demonstrations.read import Signal, feature_names, read_episode, read_primitives
 from hdril.demonstrations.schema import PROPORTIONS_PATH, SUBTASKS_PATH
 from hdril.demonstrations.write import write_dataset
@@ -120,11 +120,3 @@ def test_what_is_not_there_is_named(written: Written, tmp_path: Path) -> None:
         read_episode(written[0], 2)
     with pytest.raises(ValueError, match=f"has no {SUBTASKS_PATH}"):
         read_primitives(tmp_path)
-    assert read_provenance(tmp_path) is None
-
-
-def test_provenance_is_read_back(written: Written) -> None:
-    provenance = read_provenance(written[0])
-    assert provenance == Provenance(Recipe("table_lift"), (7, 9), {8: "table upright"})
-    assert provenance.first_seed == 7
-    assert Provenance(Recipe("table_lift"), (7, 9), {3: "table upright"}).first_seed == 3

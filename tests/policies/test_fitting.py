@@ -19,7 +19,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import make_policy
 from lerobot_policy_hdril import HDRILConfig, HDRILPolicy
 from lerobot_policy_hdril.fitting import QUIET, LearnedEpisodes
-from lerobot_policy_hdril.provenance import Origin, TrainingData, digest_of_json, from_runs, to_runs
+from lerobot_policy_hdril.provenance import Origin, TrainingData, digest_of_json, from_runs, read_told, to_runs
 from torch.utils.data import DataLoader, Dataset
 
 from tests.policies.tools import (
@@ -238,6 +238,25 @@ def test_seeds_are_those_of_the_episodes_or_unknown(copy: Path) -> None:
     path.unlink()
     record = build(read(copy)).config.training_data[0]
     assert (record.task, record.recipe, record.seeds) == (None, None, None)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "is not valid JSON"),
+        ("[]", "must hold a JSON object, not list"),
+        ('{"recipe": "mine"}', "recipe must be an object, not str"),
+        ('{"seeds": 6}', "seeds must be a list of integers"),
+        ('{"seeds": ["6"]}', "seeds must be a list of integers"),
+    ],
+)
+def test_damaged_provenance_is_named(tmp_path: Path, content: str, message: str) -> None:
+    path = tmp_path / "meta/hdril.json"
+    path.parent.mkdir()
+    path.write_text(content)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_told(tmp_path)
+    assert str(path) in str(caught.value)
 
 
 def test_runs() -> None:

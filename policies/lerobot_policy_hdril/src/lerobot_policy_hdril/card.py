@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,8 +9,7 @@ from huggingface_hub import ModelCard, ModelCardData
 from tabulate import tabulate
 
 from lerobot_policy_hdril.configuration_hdril import HDRILConfig
-from lerobot_policy_hdril.provenance import from_runs
-from lerobot_policy_hdril.schema import RECIPE_PATH
+from lerobot_policy_hdril.provenance import from_runs, read_told
 
 if TYPE_CHECKING:
     from lerobot.configs.train import TrainPipelineConfig
@@ -34,10 +32,8 @@ _CHOICES = ("preset", "interaction", "skip", "state_skip", "per_primitive", "dec
 
 def simulated_task(dataset_meta: LeRobotDatasetMetadata | None) -> str | None:
     """The task of ``--env.type=hdril`` that a dataset is of; None if hdril did not record it."""
-    if dataset_meta is None:
-        return None
-    path = Path(dataset_meta.root) / RECIPE_PATH
-    return json.loads(path.read_text())["recipe"]["task"] if path.exists() else None
+    recipe = None if dataset_meta is None else read_told(Path(dataset_meta.root))[0]
+    return None if recipe is None else recipe.get("task")
 
 
 def model_card(

@@ -57,12 +57,8 @@ class Origin:
 
 
 def read_origin(metadata: LeRobotDatasetMetadata, digest: str) -> Origin:
-    """Who made the dataset of this digest, as far as its files tell."""
-    path = Path(metadata.root) / RECIPE_PATH
-    if not path.exists():
-        return Origin(digest, metadata.repo_id)
-    told: dict[str, Any] = json.loads(path.read_text())
-    recipe, seeds = told.get("recipe"), told.get("seeds")
+    """Who made the dataset of this digest, as far as its files tell. Raises as :func:`read_told`."""
+    recipe, seeds = read_told(Path(metadata.root))
     # Episodes that a tool removed or added would be given seeds of others: then the seeds are unknown.
     if seeds is None or len(seeds) != metadata.total_episodes:
         seeds = None
@@ -73,6 +69,29 @@ def read_origin(metadata: LeRobotDatasetMetadata, digest: str) -> Origin:
         recipe=None if recipe is None else digest_of_json(recipe),
         seeds=None if seeds is None else tuple(seeds),
     )
+
+
+def read_told(root: Path) -> tuple[dict[str, Any] | None, list[int] | None]:
+    """The recipe and the seeds that hdril wrote into a dataset; None for what is not there.
+
+    Raises:
+        ValueError: the file is damaged; names it and the field.
+    """
+    path = root / RECIPE_PATH
+    if not path.exists():
+        return None, None
+    try:
+        told = json.loads(path.read_bytes())
+    except ValueError as error:  # of which JSONDecodeError and UnicodeDecodeError are kinds
+        raise ValueError(f"{path} is not valid JSON: {error}") from error
+    if not isinstance(told, dict):
+        raise ValueError(f"{path} must hold a JSON object, not {type(told).__name__}")
+    recipe, seeds = told.get("recipe"), told.get("seeds")
+    if recipe is not None and not isinstance(recipe, dict):
+        raise ValueError(f"{path}: recipe must be an object, not {type(recipe).__name__}")
+    if seeds is not None and not (isinstance(seeds, list) and all(type(seed) is int for seed in seeds)):
+        raise ValueError(f"{path}: seeds must be a list of integers")
+    return recipe, seeds
 
 
 def digest_of_json(value: Any) -> str:
