@@ -27,7 +27,7 @@ class Registry[T: Named](Mapping[str, T]):
         kind: what an entry is called in messages, such as ``task``.
         group: the entry-point group, such as ``hdril.tasks``.
         built_in: the sources of the built-in entries, by name. A source is what an entry point loads.
-        read: the entry of a source. It raises TypeError, with the reason, if the source holds none.
+        read: the entry of a source. If the source holds none, it raises TypeError: what the source is, then what was expected.
     """
 
     def __init__(self, kind: str, group: str, built_in: Mapping[str, Any], read: Callable[[Any], T]) -> None:
@@ -69,7 +69,8 @@ class Registry[T: Named](Mapping[str, T]):
 
         Raises:
             KeyError: there is no entry of that name.
-            PluginError: two packages claim the name, or the plugin cannot be imported or does not define the entry.
+            PluginError: two packages claim the name, or the plugin cannot be imported, or it is something else than an entry:
+                one line that names the distribution, the entry point and what was expected.
         """
         claims = self._plugins.get(name, [])
         if len(claims) + (name in self._built_in) > 1:
@@ -84,14 +85,16 @@ class Registry[T: Named](Mapping[str, T]):
         return self._loaded[name]
 
     def _load(self, entry_point: EntryPoint) -> Any:
+        claimed = f"the {self._kind} {entry_point.name!r} from {_origin(entry_point)}"
         try:
             source = entry_point.load()
+        except (Exception, SystemExit) as error:  # whatever a stranger's module raises
+            raise PluginError(f"{claimed} cannot be loaded: {_one_line(f'{type(error).__name__}: {error}')}") from error
+        try:
             entry = self._read(source)
-        except Exception as error:  # whatever a stranger's module raises
+        except Exception as error:  # whatever a stranger's object raises when it is looked at
             reason = str(error) if type(error) is TypeError else f"{type(error).__name__}: {error}"
-            raise PluginError(
-                f"the {self._kind} {entry_point.name!r} from {_origin(entry_point)} cannot be loaded: {reason}"
-            ) from error
+            raise PluginError(f"{claimed} cannot be used: {_one_line(reason)}") from error
         if entry.name != entry_point.name:
             raise PluginError(
                 f"the {self._kind} from {_origin(entry_point)} is named {entry.name!r}; "
@@ -105,3 +108,9 @@ def _origin(entry_point: EntryPoint) -> str:
     distribution = entry_point.dist
     owner = f"{distribution.name} {distribution.version}" if distribution else "an unknown distribution"
     return f"{owner} (entry point {entry_point.group}: {entry_point.name} = {entry_point.value})"
+
+
+def _one_line(reason: str, longest: int = 200) -> str:
+    """The reason without line breaks. Of a long one, such as the ``repr`` of a whole task, the middle is left out."""
+    line = " ".join(reason.split())
+    return line if len(line) <= longest else f"{line[: longest // 2]} … {line[-longest // 2 :]}"

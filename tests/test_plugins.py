@@ -6,8 +6,10 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from textwrap import dedent
+from typing import Any
 
 import pytest
 
@@ -147,8 +149,11 @@ def tasks_with(monkeypatch: pytest.MonkeyPatch, folder: Path) -> Registry:
             "cannot be loaded: ModuleNotFoundError: No module named 'not_installed_anywhere'",
         ),
         ("1 / 0", "cannot be loaded: ZeroDivisionError: division by zero"),
-        ("", "cannot be loaded: broken_plugin defines no TASK of type hdril.tasks.Task"),
-        ("TASK = 'chess'", "cannot be loaded: broken_plugin defines no TASK of type hdril.tasks.Task"),
+        ("raise SystemExit('no\\nlicence')", "cannot be loaded: SystemExit: no licence"),
+        ("raise TypeError('a bug')", "cannot be loaded: TypeError: a bug"),
+        ("", "cannot be used: broken_plugin defines no TASK of type hdril.tasks.Task"),
+        ("TASK = 'chess'", "cannot be used: broken_plugin defines no TASK of type hdril.tasks.Task"),
+        ("def __getattr__(name): 1 / 0", "cannot be used: ZeroDivisionError: division by zero"),
     ],
 )
 def test_a_task_that_cannot_be_loaded_says_why(monkeypatch, tmp_path: Path, source: str, reason: str) -> None:
@@ -165,6 +170,40 @@ def test_a_task_that_cannot_be_loaded_says_why(monkeypatch, tmp_path: Path, sour
             ask("chess")
         origin = "chess-club 1.0 (entry point hdril.tasks: chess = broken_plugin)"
         assert str(caught.value) == f"the task 'chess' from {origin} {reason}"
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "expected"),
+    [
+        ("task", "hdril.tasks.table_lift:TASK", "defines no TASK of type hdril.tasks.Task"),
+        ("task", "hdril.tasks.task:Task", "defines no TASK of type hdril.tasks.Task"),
+        ("task", "of_two_lines:THING", "defines no TASK of type hdril.tasks.Task"),
+        ("robot", "hdril.tasks.table_lift:TASK", "is not a hdril.simulation.robots.RobotSpec"),
+        ("robot", "hdril.simulation.robots:RobotSpec", "is not a hdril.simulation.robots.RobotSpec"),
+        ("robot", "hdril.simulation.robots.baxter", "is not a hdril.simulation.robots.RobotSpec"),
+        ("robot", "of_two_lines:THING", "is not a hdril.simulation.robots.RobotSpec"),
+    ],
+)
+def test_what_is_no_entry_is_refused_in_one_line(
+    monkeypatch, tmp_path: Path, kind: str, value: str, expected: str
+) -> None:
+    """A task instead of its module, a class instead of a robot, or an object whose ``repr`` fills a page."""
+    (tmp_path / "of_two_lines.py").write_text(
+        "class Thing:\n    def __repr__(self): return 'one\\ntwo' * 999\nTHING = Thing()\n"
+    )
+    declare(tmp_path, "chess-club", f"hdril.{kind}s", chess=value)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "of_two_lines", raising=False)
+    read: Callable[[Any], Any] = read_task if kind == "task" else read_robot
+    with pytest.raises(PluginError) as caught:
+        Registry(kind, f"hdril.{kind}s", {}, read).find("chess")
+    message = str(caught.value)
+    assert message.startswith(
+        f"the {kind} 'chess' from chess-club 1.0 (entry point hdril.{kind}s: chess = {value}) cannot be used: "
+    )
+    assert message.endswith(expected)
+    assert "\n" not in message
+    assert len(message) < 400
 
 
 def test_a_task_of_another_name_than_its_entry_point_is_refused(monkeypatch, tmp_path: Path) -> None:
