@@ -16,7 +16,8 @@ from hdril.demonstrations.provenance import Provenance, Recipe
 from hdril.demonstrations.read import Signal, feature_names, read_episode, read_primitives
 from hdril.demonstrations.schema import PROPORTIONS_PATH, SUBTASKS_PATH
 from hdril.demonstrations.write import write_dataset
-from hdril.simulation.actions import ACTION_NAMES
+from hdril.simulation.actions import ACTION_NAMES, hand_poses
+from hdril.simulation.robots import SIDES
 from hdril.tasks import TASKS
 
 Written = tuple[Path, list[Episode]]
@@ -91,7 +92,8 @@ def test_an_episode_is_read_back(written: Written) -> None:
     signal = stored.signals["observation.state"]
     assert signal.names == ACTION_NAMES
     assert set(signal.positions()) == {"left_ee", "right_ee"}
-    np.testing.assert_array_equal(signal.positions()["right_ee"], episodes[1].state[:, 8:11])
+    for index, side in enumerate(SIDES):
+        np.testing.assert_array_equal(signal.positions()[f"{side}_ee"], hand_poses(episodes[1].state)[:, index, :3])
 
 
 def test_positions_are_those_of_whole_poses() -> None:

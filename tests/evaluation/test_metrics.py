@@ -7,6 +7,9 @@ import pytest
 from numpy.typing import NDArray
 
 from hdril.evaluation.metrics import dtw_distance, trajectory_error
+from hdril.geometry import Pose
+from hdril.simulation.actions import HandCommand, join_action
+from hdril.simulation.robots import SIDES
 
 Path3 = NDArray[np.float64]
 
@@ -24,10 +27,8 @@ def walk(rng: np.random.Generator, frames: int) -> Path3:
 
 def states(left: Path3, right: Path3) -> NDArray[np.float64]:
     """States (T, 16) with the hands on two paths, upright."""
-    state = np.zeros((len(left), 16))
-    state[:, [6, 14]] = 1.0
-    state[:, 0:3], state[:, 8:11] = left, right
-    return state
+    hands = (dict(zip(SIDES, points, strict=True)) for points in zip(left, right, strict=True))
+    return np.stack([join_action({side: HandCommand(Pose(at), 0.0) for side, at in hand.items()}) for hand in hands])
 
 
 def optimal_path(a: Path3, b: Path3) -> list[tuple[int, int]]:

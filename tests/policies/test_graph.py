@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from lerobot_policy_hdril.coordinates import RelationalCoordinates
-from lerobot_policy_hdril.graph import feature_names, group_nodes, pose_columns, quaternion_groups
+from lerobot_policy_hdril.graph import feature_names, group_nodes, pose_columns, pose_groups, quaternion_groups
 from lerobot_policy_hdril.interaction import INTERACTIONS, SLOPE, ObjectAttention, ScalarAttention, make_interaction
 from scipy.spatial.transform import Rotation
 from torch.nn import functional as F
@@ -188,7 +188,7 @@ def test_nodes_without_a_pose_have_no_edges() -> None:
     graph = ObjectAttention(names, 8)
     assert graph.node_names == ["left", "right", "switch"]
     assert graph.edges.tolist() == [[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]
-    state = torch.cat([states(4)[:, :16], torch.ones(4, 1)], dim=-1)
+    state = torch.cat([states(4)[:, : len(ACTION_NAMES)], torch.ones(4, 1)], dim=-1)
     relations = graph._relations(state)
     assert (relations[:, 2] == 0.0).all()
     assert (relations[:, :, 2] == 0.0).all()
@@ -208,17 +208,18 @@ def test_object_attention_has_the_parameters_of_its_equation() -> None:
 
 
 def test_relational_coordinates_are_poses_in_the_objects_frame() -> None:
-    frame = RelationalCoordinates(NAMES, NAMES[16:], [*ACTION_NAMES, *NAMES])
+    left, right, table = pose_groups(NAMES)
+    frame = RelationalCoordinates(NAMES, [NAMES[column] for column in table], [*ACTION_NAMES, *NAMES])
     state = states(4)
     seen = frame.encode_state(state)
-    torch.testing.assert_close(seen[:, 16:], state[:, 16:])
-    torch.testing.assert_close(seen[:, [7, 15]], state[:, [7, 15]])
+    still = [column for column in range(len(NAMES)) if column not in {*left, *right}]  # the object, and the openings
+    torch.testing.assert_close(seen[:, still], state[:, still])
     for row, other in zip(state.double().numpy(), seen.double().numpy(), strict=True):
-        expected = Pose.from_vector(row[16:]).inverse() @ Pose.from_vector(row[8:15])
-        given = Pose.from_vector(other[8:15]).aligned_to(expected.quaternion)
+        expected = Pose.from_vector(row[table]).inverse() @ Pose.from_vector(row[right])
+        given = Pose.from_vector(other[right]).aligned_to(expected.quaternion)
         assert given.position == pytest.approx(expected.position, abs=1e-5)
         assert given.quaternion == pytest.approx(expected.quaternion, abs=1e-5)
-    output = torch.cat([states(4)[:, :16], states(4)], dim=-1)[:, None].repeat(1, 5, 1)
+    output = torch.cat([states(4)[:, : len(ACTION_NAMES)], states(4)], dim=-1)[:, None].repeat(1, 5, 1)
     back = frame.decode_output(frame.encode_output(output, state), state)
     torch.testing.assert_close(back, output, atol=1e-5, rtol=1e-5)
     with pytest.raises(ValueError, match="needs an object with a pose"):
