@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,8 @@ class Explanation:
     """Share of the model's attention that each hand and object receives; None if it has no attention."""
     events: tuple[str, ...] = ()
     """What it noticed at this frame, in words."""
+    starts: bool = False
+    """Whether the primitive starts at this frame. It tells one primitive that is played twice from one that goes on."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,8 @@ class Decision:
 
     action: NDArray[np.floating]
     explanation: Explanation | None = None
+    sent: NDArray[np.floating] | None = None
+    """What the robot is told instead, where the action is perturbed on purpose; datasets keep ``action``."""
 
 
 class Actor(Protocol):
@@ -44,6 +48,16 @@ class Actor(Protocol):
         ...
 
     def act(self, observation: Observation) -> Decision: ...
+
+
+@runtime_checkable
+class Privileged(Protocol):
+    """An actor that is shown the scene as it is, without the sensor's noise and delay, and with all that may vary.
+
+    A demonstrator may be: what it does is learned from what the sensor shows.
+    """
+
+    privileged: bool
 
 
 class ReplayActor:

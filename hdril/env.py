@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -9,26 +10,39 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from hdril.files import MAX_SEED
 from hdril.geometry import IDENTITY_QUATERNION
 from hdril.simulation.actions import ACTION_NAMES, split_action
 from hdril.simulation.controller import EndEffectorController
+from hdril.simulation.disturbances import Disturbances
 from hdril.simulation.robots import ROBOTS
+from hdril.simulation.sensor import Sensor
 from hdril.simulation.world import ROBOT, Physics, World
-from hdril.tasks import get_task
+from hdril.tasks import base_name, get_task
 from hdril.tasks.conditions import failed
+from hdril.tasks.events import EVENT_KINDS
+from hdril.tasks.factors import POSTURE, stream
+from hdril.tasks.scenario import Scenario
+from hdril.tasks.task import Task
 
 SETTLE_PERIODS = 2
+FALLEN = -0.15
+"""Height, m, below the bench's top, of an object that has fallen off."""
 
 
 class BimanualEnv(gym.Env):
     """A world, a task and a controller of the hands: 10 actions a second.
 
-    Observation: ``agent_pos`` (16,), measured hand poses and openings; ``environment_state`` (7 per observed object).
+    Observation: ``agent_pos`` (16,), measured hand poses and openings; ``environment_state``, poses of the observed objects
+    and, where scenes vary, their attributes (:attr:`hdril.tasks.Task.state_names`).
     Action (16,): hand poses and openings to reach, in the same order (:data:`~hdril.simulation.actions.ACTION_NAMES`);
     quaternions are normalised, openings clipped to [0, 1].
 
-    Success is judged at every frame from the task's horizon on. The first success ends the episode with a reward of 1. An
-    episode without one is cut after ``max_episode_steps`` frames, which are the horizon unless more are given.
+    A seed decides the whole scene and what happens to it (:class:`~hdril.tasks.scenario.Scenario`).
+
+    Success is judged at every frame from the task's horizon on; after the horizon it must hold for the task's ``dwell``. It
+    ends the episode with a reward of 1. An episode without one is cut after ``max_episode_steps`` frames, which are the
+    task's budget unless given, or when an object has fallen off the bench.
 
     Raises:
         ValueError: unknown task, robot or render mode, or ``max_episode_steps`` below the horizon.
@@ -47,14 +61,16 @@ class BimanualEnv(gym.Env):
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"unknown render mode {render_mode!r}; choose from: rgb_array")
-        self.task_spec, self.robot_spec = get_task(task), ROBOTS.find(robot)
+        self._declared, self.robot_spec = get_task(task), ROBOTS.find(robot)
+        self.task_spec: Task = self._declared
+        """The task as it is in the running episode."""
         self.task, self.task_description = self.task_spec.name, self.task_spec.description
         self.render_mode = render_mode
         self._max_episode_steps = self.task_spec.episode_limit(max_episode_steps, "max_episode_steps")
         self._physics, self._meshes = physics or self.task_spec.physics, meshes
         self._world: World | None = None
         self.controller = EndEffectorController(self.robot_spec)
-        high = np.full(7 * len(self.task_spec.observed), np.inf, np.float32)
+        high = np.full(len(self.task_spec.state_names), np.inf, np.float32)
         self.observation_space = spaces.Dict(
             {
                 "agent_pos": spaces.Box(-np.inf, np.inf, (len(ACTION_NAMES),), np.float32),
@@ -96,21 +112,44 @@ class BimanualEnv(gym.Env):
             world.couple_joints(ROBOT, *arm.gripper.joints, max_force=robot.actuation.finger_gear_force)
         world.set_joint_velocity_limits(ROBOT, robot.actuation.velocities)
         for body in task.bodies:
-            world.add_body(body, task.placements[body.name].sample(self.np_random))
+            world.add_body(body, self.scenario.pose(body.name))
         return world
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, NDArray[np.float32]], dict[str, Any]]:
-        """Put the objects where the seed says, the arms in their posture, and let everything come to rest."""
+        """Build the scene of the seed, the arms in their posture, and let everything come to rest.
+
+        ``options={"scenario": …}`` plays a :class:`~hdril.tasks.scenario.Scenario` instead.
+
+        Raises:
+            ValueError: the scenario is of another task.
+        """
         super().reset(seed=seed)
         self.close()
+        scenario = (options or {}).get("scenario")
+        if scenario is None:
+            scenario = self._declared.sample(int(self.np_random.integers(MAX_SEED + 1)) if seed is None else seed)
+        elif base_name(scenario.task) != base_name(self.task):
+            raise ValueError(f"this is an environment of {self.task}, the scenario is of {scenario.task}")
+        self.scenario: Scenario = scenario
+        self.task_spec = self._declared.at(scenario.values)
         self._world = self._new_world()
-        self.controller.start(self._world)
+        self.controller.start(self._world, self._posture_offsets())
         self.controller.hold(SETTLE_PERIODS * self._physics.substeps)
+        self._sensor = Sensor(self.task_spec.sensor(scenario.values), scenario.seed)
+        self._disturbances = Disturbances(self._world, self.controller, self._sensor)
         self.frame = 0
         self._stages = 0
-        return self._observe(), {"is_success": False} | self._progress(success=False)
+        self._held = 0
+        return self._observe(), {"is_success": False, "events": ""} | self._progress(success=False)
+
+    def _posture_offsets(self) -> dict[str, float]:
+        """Offsets of the arm joints from their posture, rad, by joint."""
+        largest = self.scenario.values.get(POSTURE.name, 0.0)
+        joints = [joint for arm in self.robot_spec.arms.values() for joint in arm.joints] if largest else []
+        rng = stream(self.scenario.seed, POSTURE.name)
+        return {joint: float(rng.uniform(-largest, largest)) for joint in joints}
 
     def step(
         self, action: NDArray[np.floating]
@@ -120,18 +159,42 @@ class BimanualEnv(gym.Env):
         Raises:
             ValueError: the action has another shape or is not finite; names the entries.
         """
-        world = self.world
-        self.controller.apply(split_action(action))
+        world, commands = self.world, split_action(action)
+        events = self._begin_events()
+        self.controller.apply(commands)
         self.frame += 1
-        over = self.frame >= self.task_spec.horizon
-        missing = failed(self.task_spec.success, world) if over else ("the primitives are not over",)
+        missing = self._missing(world)
         success = not missing
         info = {
             "is_success": success,
             "unmet": ", ".join(missing),
+            "events": events,
             "ik_failure": "; ".join(f"{side}: {why}" for side, why in self.controller.failures.items()),
         } | self._progress(success)
-        return self._observe(), float(success), success, not success and self.frame >= self._max_episode_steps, info
+        truncated = not success and (self.frame >= self._max_episode_steps or self._fallen(world))
+        return self._observe(), float(success), success, truncated, info
+
+    def _fallen(self, world: World) -> bool:
+        """Whether an object has fallen off the bench, so that nothing can be done any more."""
+        return any(world.pose(name).position[2] < FALLEN for name in self.task_spec.observed)
+
+    def _begin_events(self) -> str:
+        """Let those events happen that begin at this frame; says which, in words."""
+        begun = [event for event in self.scenario.events if event.frame == self.frame]
+        for event in begun:
+            EVENT_KINDS[event.kind].begin(self._disturbances, event)
+        return "; ".join(map(str, begun))
+
+    def _missing(self, world: World) -> tuple[str, ...]:
+        """Why the episode is not a success at this frame; empty if it is."""
+        task = self.task_spec
+        if self.frame < task.horizon:
+            return ("the primitives are not over",)
+        missing = failed(task.success, world)
+        self._held = 0 if missing else self._held + 1
+        if not missing and self.frame > task.horizon and self._held < task.dwell:
+            return (f"success has held for {self._held} of {task.dwell} frames",)
+        return missing
 
     def _progress(self, success: bool) -> dict[str, Any]:
         """``stage``: how many of the task's stages have been reached, success being the last; and its measures."""
@@ -140,12 +203,21 @@ class BimanualEnv(gym.Env):
         return {"stage": len(task.stages) + 1 if success else self._stages} | task.read_measures(self.world)
 
     def _observe(self) -> dict[str, NDArray[np.float32]]:
-        objects = [
-            self.world.pose(name).aligned_to(IDENTITY_QUATERNION).as_vector() for name in self.task_spec.observed
-        ]
+        task = self.task_spec
+        objects = self._sensor.observe([self.world.pose(name) for name in task.objects])
+        attributes = [value for _, value in task.attributes if task.detailed]
         return {
             "agent_pos": self.controller.observe().astype(np.float32),
-            "environment_state": np.concatenate(objects).astype(np.float32),
+            "environment_state": np.concatenate([objects, attributes]).astype(np.float32),
+        }
+
+    def exact_observation(self) -> dict[str, NDArray[np.float32]]:
+        """The observation without noise and delay, with everything that may vary between scenes: for demonstrators."""
+        task = replace(self.task_spec, detailed=True)
+        poses = [self.world.pose(name).aligned_to(IDENTITY_QUATERNION).as_vector() for name in task.objects]
+        return {
+            "agent_pos": self.controller.observe().astype(np.float32),
+            "environment_state": np.concatenate([*poses, [value for _, value in task.attributes]]).astype(np.float32),
         }
 
     def render(self) -> NDArray[np.uint8]:

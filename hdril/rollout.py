@@ -8,8 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from hdril.actor import Actor, Decision, Observation
+from hdril.actor import Actor, Decision, Observation, Privileged
 from hdril.env import BimanualEnv
+from hdril.tasks.scenario import Scenario
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,7 @@ class Transition:
 
     observation: Observation
     decision: Decision
-    """The action is float32, as it was sent."""
+    """Action and ``sent`` are float32, as datasets store them."""
     next_observation: Observation
     reward: float
     terminated: bool
@@ -47,18 +48,25 @@ class Ending:
     frames: int
 
 
-def transitions(env: BimanualEnv, actor: Actor, seed: int, *observers: Observer) -> Iterator[Transition]:
-    """Play the scene of ``seed`` frame by frame, until the environment terminates or truncates the episode."""
-    observation, info = env.reset(seed=seed)
+def transitions(
+    env: BimanualEnv, actor: Actor, seed: int, *observers: Observer, scenario: Scenario | None = None
+) -> Iterator[Transition]:
+    """Play the scene of ``seed`` frame by frame, until the environment terminates or truncates the episode.
+
+    ``scenario`` is played instead of the one that the environment samples from the seed, such as its control without events.
+    """
+    observation, info = env.reset(seed=seed, options=None if scenario is None else {"scenario": scenario})
     actor.reset(seed)
     for observer in observers:
         observer.begin(env, observation, info)
     over = False
     while not over:
-        decision = actor.act(observation)
+        decision = actor.act(env.exact_observation() if isinstance(actor, Privileged) else observation)
         # float32 is what a dataset stores: an episode can be played again from its recorded actions.
-        decision = Decision(np.asarray(decision.action, np.float32), decision.explanation)
-        following, reward, terminated, truncated, info = env.step(decision.action)
+        action = np.asarray(decision.action, np.float32)
+        sent = action if decision.sent is None else np.asarray(decision.sent, np.float32)
+        decision = Decision(action, decision.explanation, sent)
+        following, reward, terminated, truncated, info = env.step(sent)
         transition = Transition(observation, decision, following, float(reward), terminated, truncated, info)
         for observer in observers:
             observer.observe(transition)
@@ -66,9 +74,11 @@ def transitions(env: BimanualEnv, actor: Actor, seed: int, *observers: Observer)
         observation, over = following, terminated or truncated
 
 
-def run_episode(env: BimanualEnv, actor: Actor, seed: int, *observers: Observer) -> Ending:
-    """Play the scene of ``seed`` to its end."""
+def run_episode(
+    env: BimanualEnv, actor: Actor, seed: int, *observers: Observer, scenario: Scenario | None = None
+) -> Ending:
+    """Play the scene of ``seed``, or a scenario (see :func:`transitions`), to its end."""
     frames, info = 0, {}
-    for transition in transitions(env, actor, seed, *observers):
+    for transition in transitions(env, actor, seed, *observers, scenario=scenario):
         frames, info = frames + 1, transition.info
     return Ending(bool(info["is_success"]), str(info["unmet"]), frames)

@@ -24,7 +24,7 @@ class Countdown:
     def _observe(self) -> Observation:
         return {"agent_pos": np.array([self.frame], np.float32)}
 
-    def reset(self, *, seed: int) -> tuple[Observation, dict[str, Any]]:
+    def reset(self, *, seed: int, options: None = None) -> tuple[Observation, dict[str, Any]]:
         self.frame, self.seed, self.actions = 0, seed, []
         return self._observe(), {"frame": 0}
 

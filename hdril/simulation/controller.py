@@ -43,12 +43,20 @@ class EndEffectorController:
         }
         self.results: dict[str, IKResult] = {}
 
-    def start(self, world: World) -> None:
-        """Take over the robot of a new world: arms in their posture, hands open, held there."""
+    def start(self, world: World, offsets: dict[str, float] | None = None) -> None:
+        """Take over the robot of a new world: arms in their posture, hands open, held there.
+
+        ``offsets`` are added to the posture, by joint, rad.
+        """
         self._world = world
+        self._forced_open: dict[str, int] = {}
+        self._stopped: dict[int, tuple[float, int]] = {}
         self._indices = world.joint_indices(ROBOT, self.joint_names)
         self._fingers = {side: world.joint_indices(ROBOT, arm.gripper.joints) for side, arm in self._robot.arms.items()}
-        self._arm_targets = {side: posture.copy() for side, posture in self._posture.items()}
+        self._arm_targets = {
+            side: posture + [(offsets or {}).get(joint, 0.0) for joint in self._robot.arms[side].joints]
+            for side, posture in self._posture.items()
+        }
         self._targets = self._joint_targets(dict.fromkeys(SIDES, 1.0))
         world.reset_joints(ROBOT, self.joint_names, self._targets.tolist())
         self._drive(self._targets)
@@ -60,17 +68,46 @@ class EndEffectorController:
         return {side: result.reason for side, result in self.results.items() if not result.ok}
 
     def _joint_targets(self, openings: dict[str, float]) -> NDArray[np.float64]:
-        fingers = [self._robot.arms[side].gripper.targets(openings[side]) for side in SIDES]
+        forced = dict.fromkeys(self._forced_open, 1.0)
+        fingers = [self._robot.arms[side].gripper.targets((openings | forced)[side]) for side in SIDES]
         return np.concatenate([*(self._arm_targets[side] for side in SIDES), *fingers])
 
     def _drive(self, targets: NDArray[np.float64]) -> None:
-        self._world.drive(ROBOT, self._indices, targets.tolist(), self._gains, self._forces)
+        values = targets.tolist()
+        for joint, (position, _) in self._stopped.items():
+            values[joint] = position
+        self._world.drive(ROBOT, self._indices, values, self._gains, self._forces)
 
     def apply(self, commands: dict[str, HandCommand]) -> None:
         """Run one control period towards ``commands``."""
         for side, command in commands.items():
             self.results[side] = self._aim(side, command.pose)
         self._ramp(self._joint_targets({side: command.opening for side, command in commands.items()}))
+        self._forced_open = {side: left - 1 for side, left in self._forced_open.items() if left > 1}
+        self._stopped = {joint: (at, left - 1) for joint, (at, left) in self._stopped.items() if left > 1}
+
+    def force_open(self, side: str, periods: int) -> None:
+        """Keep the fingers of a hand open for the next control periods, whatever is commanded.
+
+        Raises:
+            ValueError: there is no such hand.
+        """
+        if side not in SIDES:
+            raise ValueError(f"no hand {side!r}; hands: {', '.join(SIDES)}")
+        self._forced_open[side] = periods
+
+    def stop_motor(self, joint: str, periods: int) -> None:
+        """Hold an arm's joint where it is for the next control periods, whatever is commanded.
+
+        Raises:
+            ValueError: the arms have no such joint.
+        """
+        arm_joints = self.joint_names[: self._arm_count]
+        if joint not in arm_joints:
+            raise ValueError(f"no motor {joint!r}; motors: {', '.join(arm_joints)}")
+        index = arm_joints.index(joint)
+        position = self._world.joint_positions(ROBOT, self._indices)[index]
+        self._stopped[index] = (float(position), periods)
 
     def _aim(self, side: str, pose: Pose) -> IKResult:
         """Move an arm's joint targets towards a tool pose (world), or leave them if inverse kinematics fails."""

@@ -60,12 +60,31 @@ class Camera:
     height: int = 240
 
 
+@dataclass
+class _Push:
+    """A force (3,), N, at a body's centre of mass, for the next ``left`` timesteps."""
+
+    body: int
+    force: NDArray[np.float64]
+    left: int
+
+
+@dataclass
+class _Slide:
+    """A displacement (3,), m, of an immovable body in each of the next ``left`` timesteps."""
+
+    body: int
+    step: NDArray[np.float64]
+    left: int
+
+
 class World:
     """A PyBullet world with a robot and bodies, addressed by name.
 
     Every episode gets a world of its own, which takes 50 to 100 ms. Restoring a saved state would be faster, but after a
     contact PyBullet restores it with other last digits, and the episode could not be repeated bit for bit. Once the world has
-    stepped, only :meth:`step` moves bodies.
+    stepped, only :meth:`step` moves bodies: by its motors, by gravity and contacts, and by the disturbances that were
+    declared (:meth:`push`, :meth:`slide`).
     """
 
     def __init__(self, physics: Physics | None = None) -> None:
@@ -75,11 +94,13 @@ class World:
             raise RuntimeError("PyBullet gave no physics client; too many worlds are open in this process")
         self._ids: dict[str, int] = {}
         self._body_frames: dict[str, Pose] = {}  # of bodies made of boxes, in their inertial frames
+        self._immovable: set[str] = set()
         self._joints: dict[str, dict[str, int]] = {}
         self._links: dict[str, dict[str, int]] = {}
         self._link_names: dict[int, dict[int, str]] = {}
         self._names: dict[int, str] = {}
         self._began = False
+        self._disturbing: list[_Push | _Slide] = []
         self._call("setPhysicsEngineParameter", fixedTimeStep=self.physics.timestep, numSubSteps=0,
                    numSolverIterations=self.physics.solver_iterations, deterministicOverlappingPairs=1)  # fmt: skip
         self._call("setGravity", 0.0, 0.0, -self.physics.gravity)
@@ -140,6 +161,8 @@ class World:
                 "activationState": bullet.ACTIVATION_STATE_DISABLE_SLEEPING,
             }
         self._call("changeDynamics", body, -1, **dynamics)
+        if spec.mass <= 0:
+            self._immovable.add(spec.name)
         self._register(spec.name, body, spec.name)
         self._body_frames[spec.name] = inertial.inverse()
 
@@ -214,7 +237,41 @@ class World:
         """Advance by ``count`` timesteps."""
         self._began = True
         for _ in range(count):
+            if self._disturbing:
+                self._disturb()
             bullet.stepSimulation(physicsClientId=self._client)
+
+    def push(self, body: str, impulse: Sequence[float], steps: int) -> None:
+        """Push a body at its centre of mass during the next ``steps`` timesteps: ``impulse`` (3,), N s, in the world's frame.
+
+        Raises:
+            ValueError: the body is immovable.
+        """
+        if body in self._immovable:
+            raise ValueError(f"{body} is immovable and cannot be pushed")
+        force = np.asarray(impulse, dtype=np.float64) / (steps * self.physics.timestep)
+        self._disturbing.append(_Push(self._id(body), force, steps))
+
+    def slide(self, body: str, offset: Sequence[float], steps: int) -> None:
+        """Move an immovable body by ``offset`` (3,), m, in equal parts during the next ``steps`` timesteps.
+
+        Raises:
+            ValueError: the body is not immovable.
+        """
+        if body not in self._immovable:
+            raise ValueError(f"{body} is not immovable: only forces move it")
+        self._disturbing.append(_Slide(self._id(body), np.asarray(offset, dtype=np.float64) / steps, steps))
+
+    def _disturb(self) -> None:
+        for item in self._disturbing:
+            position, quaternion = self._call("getBasePositionAndOrientation", item.body)
+            if isinstance(item, _Push):
+                self._call("applyExternalForce", item.body, -1, item.force, position, bullet.WORLD_FRAME)
+            else:
+                moved = np.add(position, item.step)
+                self._call("resetBasePositionAndOrientation", item.body, moved, quaternion)
+            item.left -= 1
+        self._disturbing = [item for item in self._disturbing if item.left]
 
     def drive(
         self,

@@ -18,7 +18,7 @@ from pkgutil import iter_modules
 from types import ModuleType
 
 from hdril.plugins import Registry
-from hdril.tasks.task import Task, Uniform, fixed
+from hdril.tasks.task import Task, Uniform, Variation, fixed
 
 
 def _discover() -> dict[str, ModuleType]:
@@ -51,27 +51,64 @@ def base_name(name: str) -> str:
     return name.partition(":")[0]
 
 
+NOMINAL_LEVEL, VARIED, HARD = "nominal", "varied", "hard"
+LEVELS = (NOMINAL_LEVEL, VARIED, HARD)
+"""``nominal``: only placements vary. ``varied``: every factor. ``hard``: every factor, and one event in each episode."""
+ANY_EVENT, DETAILED = "any_event", "detailed"
+
+
+def _builder(base: str) -> dict[str, float]:
+    """The parameters of a task's ``make_task``, with their defaults."""
+    build = getattr(TASKS.source(base), "make_task", None)
+    return {name: float(entry.default) for name, entry in signature(build).parameters.items()} if build else {}
+
+
+def _at_level(task: Task, level: str) -> dict[str, float]:
+    varied = level in (VARIED, HARD)
+    return {
+        **{factor.name: factor.span if varied else factor.off for factor in task.all_factors},
+        **dict.fromkeys((spec.name for spec in task.events), 0.0),
+        ANY_EVENT: float(level == HARD and bool(task.events)),
+    }
+
+
 def task_parameters(name: str) -> dict[str, float]:
     """The parameters of a task: those that ``name`` gives, and the defaults of the others.
 
+    They are the parameters of its ``make_task``, the ranges of its factors, the probabilities of its events, and
+    ``detailed``: 1 if all is observed that may vary (the default as soon as something does), 0 if it is observed as in the
+    nominal task. ``level=…`` sets all ranges and probabilities at once.
+
     Raises:
-        ValueError: unknown name or parameter, or a value that is not a number; lists the valid ones. Also if the task is from
-            another package and cannot be imported (:class:`~hdril.plugins.PluginError`).
+        ValueError: unknown name, level or parameter, or a value that is not a number or out of range; lists the valid ones.
+            Also if the task is from another package and cannot be imported (:class:`~hdril.plugins.PluginError`).
     """
     base, _, settings = name.partition(":")
-    TASKS.find(base)
-    build = getattr(TASKS.source(base), "make_task", None)
-    known = signature(build).parameters if build else {}
-    values = {parameter: float(entry.default) for parameter, entry in known.items()}
-    for setting in settings.split(",") if settings else ():
-        parameter, _, text = setting.partition("=")
-        if parameter not in known:
-            raise ValueError(f"{base} has no parameter {parameter!r}; it has: {', '.join(known) or 'none'}")
+    task, given = TASKS.find(base), _settings(settings)
+    level = given.pop("level", NOMINAL_LEVEL)
+    if level not in LEVELS:
+        raise ValueError(f"unknown level {level!r}; choose from: {', '.join(LEVELS)}")
+    variable = _at_level(task, level)
+    values = _builder(base) | variable
+    for parameter, text in given.items():
+        if parameter not in (*values, DETAILED):
+            raise ValueError(f"{base} has no parameter {parameter!r}; it has: level, {', '.join((*values, DETAILED))}")
         try:
             values[parameter] = float(text)
         except ValueError:
             raise ValueError(f"{parameter} must be a number, got {text!r}") from None
+    nominal = _at_level(task, NOMINAL_LEVEL)
+    values.setdefault(DETAILED, float(any(values[key] != nominal[key] for key in nominal)))
+    for factor in task.all_factors:
+        factor.check(values[factor.name])
+    for probability in (*(spec.name for spec in task.events), ANY_EVENT, DETAILED):
+        if not 0.0 <= values[probability] <= 1.0:
+            raise ValueError(f"{probability} must be from 0 to 1, got {values[probability]:g}")
     return values
+
+
+def _settings(text: str) -> dict[str, str]:
+    return {key: value for key, _, value in (item.partition("=") for item in text.split(",") if item)}
 
 
 def get_task(name: str) -> Task:
@@ -81,7 +118,16 @@ def get_task(name: str) -> Task:
         ValueError: as :func:`task_parameters`, or a value that is out of range.
     """
     values, (base, _, settings) = task_parameters(name), name.partition(":")
-    return replace(TASKS.source(base).make_task(**values), name=name) if settings else TASKS[base]
+    if not settings:
+        return TASKS[base]
+    build = {parameter: values[parameter] for parameter in _builder(base)}
+    task = TASKS.source(base).make_task(**build) if build else TASKS[base]
+    variation = Variation(
+        {factor.name: values[factor.name] for factor in task.all_factors if values[factor.name] != factor.off},
+        {spec.name: values[spec.name] for spec in task.events if values[spec.name]},
+        values[ANY_EVENT],
+    )
+    return replace(task, name=name, variation=variation, detailed=bool(values[DETAILED]))
 
 
-__all__ = ["TASKS", "Task", "Uniform", "base_name", "fixed", "get_task", "task_parameters"]
+__all__ = ["LEVELS", "TASKS", "Task", "Uniform", "base_name", "fixed", "get_task", "task_parameters"]

@@ -1,18 +1,19 @@
 """Movement primitives: labelled pieces of a demonstration, each a short list of waypoints for both hands.
 
 A primitive is planned from what is observed at its first frame, so that each one starts from where the objects really are.
-The functions under "constructors" make the primitives; a task puts them in order.
+Where a segment follows an object, the rest of the plan is made anew when that object moves. The functions under
+"constructors" make the primitives; a task puts them in order and says what each one needs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hdril.geometry import Pose, interpolate
+from hdril.geometry import Pose, geodesic_distance, interpolate
 from hdril.simulation.actions import HandCommand, join_action
 from hdril.simulation.robots.spec import SIDES
 
@@ -21,10 +22,33 @@ Hands = dict[str, HandCommand]
 
 @dataclass(frozen=True)
 class Scene:
-    """What a primitive is planned from: what the hands were last told, and where the observed objects are (world)."""
+    """What a primitive is planned from: what the hands were last told, where they are, and where the objects are (world)."""
 
     hands: Hands
+    """What the hands were last told. Plans begin here and not where the hands are: a load pulls a hand away from its target,
+    and planning from there would loosen the grip a little with every primitive."""
     objects: dict[str, Pose]
+    measured: Hands = field(default_factory=dict)
+    """Where the hands are, and how far they are open."""
+    attributes: dict[str, float] = field(default_factory=dict)
+    """:attr:`hdril.tasks.Task.attributes` of the scene."""
+
+
+Number = float | Callable[[Scene], float]
+"""A number that may depend on the scene."""
+
+
+def number(value: Number, scene: Scene) -> float:
+    """The number in this scene."""
+    return value(scene) if callable(value) else value
+
+
+@dataclass(frozen=True)
+class Need:
+    """A named test of a scene, as the expert sees it."""
+
+    name: str
+    holds: Callable[[Scene], bool]
 
 
 @dataclass(frozen=True)
@@ -32,7 +56,7 @@ class Segment:
     """``frames`` waypoints from the hands of the segment before to ``goal(scene)``.
 
     ``jitter`` scales the expert's noise. ``rigid`` gives both hands the same noise, because two stiff hands that hold one
-    body work against each other if they differ.
+    body work against each other if they differ. When one of the objects in ``follows`` moves, the rest is planned anew.
 
     Raises:
         ValueError: there is not one frame.
@@ -42,6 +66,7 @@ class Segment:
     goal: Callable[[Scene], Hands]
     jitter: float = 1.0
     rigid: bool = False
+    follows: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.frames < 1:
@@ -50,14 +75,31 @@ class Segment:
 
 @dataclass(frozen=True)
 class Primitive:
-    """A label and the segments that make its waypoints."""
+    """A label and the segments that make its waypoints.
+
+    The expert plays it only while all ``needs`` hold, and passes over it where ``unless`` holds.
+    """
 
     name: str
     segments: tuple[Segment, ...]
+    needs: tuple[Need, ...] = ()
+    unless: Need | None = None
 
     @property
     def frames(self) -> int:
         return sum(segment.frames for segment in self.segments)
+
+    def needing(self, *needs: Need, unless: Need | None = None) -> Primitive:
+        """This primitive with these needs."""
+        return replace(self, needs=needs, unless=unless)
+
+    def possible(self, scene: Scene) -> bool:
+        """Whether all needs hold."""
+        return all(need.holds(scene) for need in self.needs)
+
+    def superfluous(self, scene: Scene) -> bool:
+        """Whether what it is for has been done."""
+        return self.unless is not None and self.unless.holds(scene)
 
 
 @dataclass(frozen=True)
@@ -94,23 +136,86 @@ def _offsets(segment: Segment, noise: Noise, rng: np.random.Generator) -> dict[s
     return {side: noise.waypoint * segment.jitter * envelope * (wave @ draw) for side, draw in offsets.items()}
 
 
+FOLLOW_DISTANCE, FOLLOW_ANGLE = 0.005, np.deg2rad(2.0)
+"""A plan is made anew when an object that it follows is further than this, m and rad, from where it was planned for."""
+
+
+class Plan:
+    """The waypoints (frames, 16) of a primitive, in the order of :data:`hdril.simulation.actions.ACTION_NAMES`.
+
+    Its length does not change, whatever it follows.
+    """
+
+    def __init__(self, primitive: Primitive, scene: Scene, noise: Noise, rng: np.random.Generator) -> None:
+        self.primitive = primitive
+        self._scene = scene
+        offsets = [_offsets(segment, noise, rng) for segment in primitive.segments]
+        self._offsets = {side: np.concatenate([each[side] for each in offsets]) for side in SIDES}
+        self._frame = 0
+        self._clean: list[Hands] = []
+        self._plan()
+
+    @property
+    def over(self) -> bool:
+        """Whether there are no more waypoints."""
+        return self._frame >= self.primitive.frames
+
+    def next(self) -> NDArray[np.float64]:
+        """The next waypoint (16,)."""
+        self._frame += 1
+        return join_action(self._noisy(self._frame - 1))
+
+    def follow(self, scene: Scene) -> None:
+        """Plan the rest anew if an object that is followed has moved."""
+        if self.over:
+            return
+        segment, _ = self._locate(self._frame)
+        moved = {name: scene.objects[name] for name in segment.follows if _moved(self._scene, scene, name)}
+        if moved:
+            self._scene = replace(self._scene, objects=self._scene.objects | moved)
+            self._plan()
+
+    def _locate(self, frame: int) -> tuple[Segment, int]:
+        """The segment of a frame, and the frame's place in it."""
+        for segment in self.primitive.segments:
+            if frame < segment.frames:
+                return segment, frame
+            frame -= segment.frames
+        raise IndexError("the primitive is over")
+
+    def _plan(self) -> None:
+        """Waypoints without noise from the present frame on, from the last one that was told."""
+        start = self._clean[self._frame - 1] if self._frame else self._scene.hands
+        clean, first = self._clean[: self._frame], self._frame
+        for segment in self.primitive.segments:
+            if first >= segment.frames:
+                first -= segment.frames
+                continue
+            goal, done = segment.goal(self._scene), _ease(first / segment.frames)
+            for i in range(first, segment.frames):
+                fraction = (_ease((i + 1) / segment.frames) - done) / (1.0 - done)
+                poses = {side: interpolate(start[side].pose, goal[side].pose, fraction) for side in SIDES}
+                clean.append({side: HandCommand(poses[side], goal[side].opening) for side in SIDES})
+            start, first = goal, 0
+        self._clean = clean
+
+    def _noisy(self, frame: int) -> Hands:
+        return {
+            side: HandCommand(hand.pose.translated(self._offsets[side][frame]), hand.opening)
+            for side, hand in self._clean[frame].items()
+        }
+
+
+def _moved(before: Scene, now: Scene, name: str) -> bool:
+    a, b = before.objects[name], now.objects[name]
+    far = float(np.linalg.norm(a.position - b.position)) > FOLLOW_DISTANCE
+    return far or float(geodesic_distance(a.quaternion, b.quaternion)) > FOLLOW_ANGLE
+
+
 def plan(primitive: Primitive, scene: Scene, noise: Noise, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Waypoints (frames, 16) of a primitive from ``scene``, in the order of :data:`hdril.simulation.actions.ACTION_NAMES`."""
-    waypoints, start = [], scene.hands
-    for segment in primitive.segments:
-        goal, offsets = segment.goal(scene), _offsets(segment, noise, rng)
-        for i in range(segment.frames):
-            fraction = _ease((i + 1) / segment.frames)
-            hands = {
-                side: HandCommand(
-                    interpolate(start[side].pose, goal[side].pose, fraction).translated(offsets[side][i]),
-                    goal[side].opening,
-                )
-                for side in SIDES
-            }
-            waypoints.append(join_action(hands))
-        start = goal
-    return np.stack(waypoints)
+    """All waypoints (frames, 16) of a primitive from ``scene``, if nothing moves that it follows."""
+    whole = Plan(primitive, scene, noise, rng)
+    return np.stack([whole.next() for _ in range(primitive.frames)])
 
 
 # ---------------------------------------------------------------------- goals
@@ -118,10 +223,14 @@ def plan(primitive: Primitive, scene: Scene, noise: Noise, rng: np.random.Genera
 
 @dataclass(frozen=True)
 class Grip:
-    """Where a hand takes hold: a tool pose in the frame of a body."""
+    """Where a hand takes hold: a tool pose in the frame of a body, which may depend on the scene."""
 
     body: str
-    pose: Pose
+    pose: Pose | Callable[[Scene], Pose]
+
+    def tool(self, scene: Scene) -> Pose:
+        """The tool pose in the world."""
+        return scene.objects[self.body] @ (self.pose(scene) if callable(self.pose) else self.pose)
 
 
 Grips = dict[str, Grip]
@@ -134,11 +243,46 @@ def at_grips(grips: Grips, opening: float, back_off: float = 0.0, above: float =
     def goal(scene: Scene) -> Hands:
         retreat = Pose((0.0, 0.0, -back_off))
         return {
-            side: HandCommand((scene.objects[grip.body] @ grip.pose @ retreat).translated((0.0, 0.0, above)), opening)
+            side: HandCommand((grip.tool(scene) @ retreat).translated((0.0, 0.0, above)), opening)
             for side, grip in grips.items()
         }
 
     return goal
+
+
+def _bodies(grips: Grips) -> tuple[str, ...]:
+    """What the grips are on, each once."""
+    return tuple(dict.fromkeys(grip.body for grip in grips.values()))
+
+
+# ---------------------------------------------------------------------- needs
+
+
+def holding(grips: Grips, tolerance: float = 0.03, thinnest: float = 0.2) -> Need:
+    """Each hand holds what it grips: it was told to close, it is within ``tolerance`` m of its grip, and it is not empty.
+
+    A hand that closes on nothing is open by less than ``thinnest`` (0 to 1).
+    """
+
+    def holds(scene: Scene) -> bool:
+        return all(
+            scene.hands[side].opening < 0.5
+            and scene.measured[side].opening > thinnest
+            and np.linalg.norm(scene.measured[side].pose.position - grip.tool(scene).position) < tolerance
+            for side, grip in grips.items()
+        )
+
+    return Need(f"both hands hold {', '.join(_bodies(grips))}", holds)
+
+
+def stands_at(body: str, height: Number, tolerance: float = 0.03) -> Need:
+    """The body's origin is within ``tolerance`` of ``height``, m, and it stands upright."""
+
+    def holds(scene: Scene) -> bool:
+        pose, wanted = scene.objects[body], number(height, scene)
+        return bool(abs(pose.position[2] - wanted) < tolerance and pose.rotation_matrix()[2, 2] > 0.95)
+
+    return Need(f"{body} stands", holds)
 
 
 Targets = Callable[[Scene], dict[str, Pose]]
@@ -177,8 +321,8 @@ def grasp(grips: Grips, frames: int = 10, clearance: float = 0.08) -> Primitive:
     return Primitive(
         "grasp",
         (
-            Segment(frames - close - reach, at_grips(grips, 1.0, back_off=clearance)),
-            Segment(reach, at_grips(grips, 1.0), jitter=0.25),
+            Segment(frames - close - reach, at_grips(grips, 1.0, back_off=clearance), follows=_bodies(grips)),
+            Segment(reach, at_grips(grips, 1.0), jitter=0.25, follows=_bodies(grips)),
             Segment(close, at_grips(grips, 0.0), jitter=0.0),
         ),
     )
@@ -186,7 +330,7 @@ def grasp(grips: Grips, frames: int = 10, clearance: float = 0.08) -> Primitive:
 
 def reach(name: str, grips: Grips, frames: int = 10, above: float = 0.12) -> Primitive:
     """Bring open hands to ``above`` metres over their grips."""
-    return Primitive(name, (Segment(frames, at_grips(grips, 1.0, above=above)),))
+    return Primitive(name, (Segment(frames, at_grips(grips, 1.0, above=above), follows=_bodies(grips)),))
 
 
 def lower(name: str, grips: Grips, frames: int = 10) -> Primitive:
@@ -195,16 +339,27 @@ def lower(name: str, grips: Grips, frames: int = 10) -> Primitive:
     return Primitive(
         name,
         (
-            Segment(frames - close, at_grips(grips, 1.0), jitter=0.25),
+            Segment(frames - close, at_grips(grips, 1.0), jitter=0.25, follows=_bodies(grips)),
             Segment(close, at_grips(grips, 0.0), jitter=0.0),
         ),
     )
 
 
-def carry(name: str, body: str, target: Callable[[Pose], Pose], frames: int = 12, jitter: float = 1.0) -> Primitive:
-    """Take a body that both hands hold to ``target(body pose)``."""
-    goal = carry_to(dict.fromkeys(SIDES, body), lambda scene: {body: target(scene.objects[body])})
-    return Primitive(name, (Segment(frames, goal, jitter=jitter, rigid=True),))
+def carry(
+    name: str,
+    body: str,
+    target: Callable[[Pose, Scene], Pose],
+    frames: int = 12,
+    jitter: float = 1.0,
+    follows: tuple[str, ...] = (),
+) -> Primitive:
+    """Take a body that both hands hold to ``target(body pose, scene)``.
+
+    The goal hangs on where body and hands were when the primitive began, so that a plan that is made anew does not drift. It
+    follows only what stands elsewhere.
+    """
+    goal = carry_to(dict.fromkeys(SIDES, body), lambda scene: {body: target(scene.objects[body], scene)})
+    return Primitive(name, (Segment(frames, goal, jitter=jitter, rigid=True, follows=follows),))
 
 
 def carry_each(
@@ -214,24 +369,41 @@ def carry_each(
     return Primitive(name, (Segment(frames, carry_to(held, targets), jitter=jitter, rigid=rigid),))
 
 
-def move(body: str, x: float, y: float, frames: int = 12) -> Primitive:
+def move(body: str, x: Number, y: Number, frames: int = 12) -> Primitive:
     """Slide a held body over the bench to (x, y), m, squaring it to the world's axes."""
-    return carry("move", body, lambda pose: Pose((x, y, pose.position[2])), frames, jitter=0.5)
+
+    def target(pose: Pose, scene: Scene) -> Pose:
+        return Pose((number(x, scene), number(y, scene), pose.position[2]))
+
+    return carry("move", body, target, frames, jitter=0.5)
 
 
-def lift(body: str, height: float, frames: int = 12) -> Primitive:
+def lift(body: str, height: Number, frames: int = 12) -> Primitive:
     """Raise a held body to ``height``, m, level."""
-    return carry("lift", body, lambda pose: Pose((pose.position[0], pose.position[1], height)), frames)
+    return carry("lift", body, _at_height(height), frames)
 
 
-def extend(body: str, x: float, y: float, frames: int = 12) -> Primitive:
+def extend(body: str, x: Number, y: Number, frames: int = 12, follows: tuple[str, ...] = ()) -> Primitive:
     """Bring a lifted body forward to (x, y), m, level."""
-    return carry("extend", body, lambda pose: Pose((x, y, pose.position[2])), frames)
+
+    def target(pose: Pose, scene: Scene) -> Pose:
+        return Pose((number(x, scene), number(y, scene), pose.position[2]))
+
+    return carry("extend", body, target, frames, follows=follows)
 
 
-def place(body: str, height: float, frames: int = 12) -> Primitive:
+def place(body: str, height: Number, frames: int = 12) -> Primitive:
     """Set a held body down on a surface at ``height``, m."""
-    return carry("place", body, lambda pose: Pose((pose.position[0], pose.position[1], height)), frames, jitter=0.5)
+    return carry("place", body, _at_height(height), frames, jitter=0.5)
+
+
+def _at_height(height: Number) -> Callable[[Pose, Scene], Pose]:
+    """A body where it is, level, at a height."""
+
+    def target(pose: Pose, scene: Scene) -> Pose:
+        return Pose((pose.position[0], pose.position[1], number(height, scene)))
+
+    return target
 
 
 def lift_joined(name: str = "lift", rise: float = 0.12, squeeze: float = 0.006, frames: int = 10) -> Primitive:

@@ -6,69 +6,193 @@ arm cannot do it and the jaws close on nothing but the handles.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hdril.geometry import Pose
 from hdril.simulation.bodies import BodySpec, Box
+from hdril.simulation.robots.spec import SIDES
 from hdril.simulation.world import ROBOT
 from hdril.tasks.bench import BENCH, BENCH_PLACEMENT
 from hdril.tasks.conditions import at_height, at_rest, not_touching, touching, upright
-from hdril.tasks.primitives import Grip, extend, grasp, lift, move, place, retract
-from hdril.tasks.task import Task, Uniform, fixed
+from hdril.tasks.events import EventSpec
+from hdril.tasks.factors import Factor
+from hdril.tasks.primitives import (
+    Grip,
+    Need,
+    Scene,
+    extend,
+    grasp,
+    holding,
+    lift,
+    move,
+    place,
+    retract,
+    stands_at,
+)
+from hdril.tasks.task import Task, Uniform, Values, fixed
 
 DEPTH, WIDTH, TOP = 0.35, 0.85, 0.30
 BOARD = 0.06  # thicker than the jaws are wide, so that the board itself cannot be pinched
 HANDLE_Y, GRIP_HEIGHT = 0.41, 0.355
-PLATFORM_HEIGHT, PLATFORM_X = 0.12, 0.98
+LEG_X, LEG_Y, LEG = 0.10, 0.35, 0.04
+PLATFORM_HEIGHT, PLATFORM_X, PLATFORM_DEPTH = 0.12, 0.98, 0.30
+MOVED_X = 0.66
 
 WOOD, DARK, STEEL = (0.80, 0.62, 0.42, 1.0), (0.45, 0.31, 0.20, 1.0), (0.35, 0.42, 0.50, 1.0)
 
-TABLE = BodySpec(
-    "table",
-    (
-        Box((DEPTH, WIDTH, BOARD), (0.0, 0.0, TOP - BOARD / 2), WOOD),
-        *(
-            Box((0.04, 0.04, TOP - BOARD), (x, y, (TOP - BOARD) / 2), DARK)
-            for x in (-0.10, 0.10)
-            for y in (-0.35, 0.35)
-        ),
-        *(Box((0.08, 0.025, 0.09), (0.0, y, TOP + 0.045), DARK) for y in (-HANDLE_Y, HANDLE_Y)),
-    ),
-    # One arm can lift a table of 0.5 kg. Tests check that one arm fails at this mass.
-    mass=2.0,
+FACTORS = (
+    Factor("yaw", "offset", 30.0, 45.0, "deg", "the table's heading"),
+    Factor("size", "scale", 0.15, 0.25, "", "length and depth of the table, its legs and handles with them",
+           ("length", "depth")),
+    Factor("mass", "ratio", 2.0, 3.0, "", "the table's mass"),
+    Factor("friction", "scale", 0.4, 0.6, "", "friction of the table on bench, platform and pads"),
+    Factor("platform", "offset", 0.10, 0.15, "m", "where the platform stands", ("x", "y")),
+    Factor("platform_height", "offset", 0.04, 0.06, "m", "how high the platform is"),
+)  # fmt: skip
+ARM_JOINTS = tuple(f"{side}_{joint}" for side in SIDES for joint in ("s1", "e1", "w1"))
+EVENTS = (
+    EventSpec("push", "push", (1, 9), ("table",), strength=(0.4, 1.25)),
+    EventSpec("push_held", "push", (24, 48), ("table",), strength=(0.4, 1.25)),
+    EventSpec("open_hand", "open_hand", (8, 46), SIDES, frames=(3, 6)),
+    EventSpec("stop_motor", "stop_motor", (2, 50), ARM_JOINTS, frames=(5, 10)),
+    EventSpec("platform_slide", "slide", (12, 40), ("platform",), frames=(8, 12), strength=(0.03, 0.06)),
+    EventSpec("freeze", "freeze", (0, 50), frames=(5, 15)),
+    EventSpec("repeat", "repeat", (0, 50), frames=(15, 30)),
 )
-PLATFORM = BodySpec("platform", (Box((0.30, 0.90, PLATFORM_HEIGHT), (0.0, 0.0, PLATFORM_HEIGHT / 2), STEEL),))
+
+
+def _table(values: Values) -> BodySpec:
+    length, depth = values.get("size:length", 1.0), values.get("size:depth", 1.0)
+    return BodySpec(
+        "table",
+        (
+            Box((DEPTH * depth, WIDTH * length, BOARD), (0.0, 0.0, TOP - BOARD / 2), WOOD),
+            *(
+                Box((LEG, LEG, TOP - BOARD), (x, y, (TOP - BOARD) / 2), DARK)
+                for x in (-LEG_X * depth, LEG_X * depth)
+                for y in (-LEG_Y * length, LEG_Y * length)
+            ),
+            *(Box((0.08, 0.025, 0.09), (0.0, y, TOP + 0.045), DARK) for y in (-HANDLE_Y * length, HANDLE_Y * length)),
+        ),
+        # One arm can lift a table of 0.5 kg. Tests check that one arm fails at every mass that is drawn.
+        mass=2.0 * values.get("mass", 1.0),
+        friction=0.8 * values.get("friction", 1.0),
+    )
+
+
+def _platform_height(values: Values) -> float:
+    return PLATFORM_HEIGHT + values.get("platform_height", 0.0)
+
+
+def _platform(values: Values) -> BodySpec:
+    height = _platform_height(values)
+    return BodySpec("platform", (Box((PLATFORM_DEPTH, 0.90, height), (0.0, 0.0, height / 2), STEEL),))
+
+
+def admissible(poses: dict[str, Pose], values: Values) -> bool:
+    """Whether the table's legs stand beside the platform and not in it: at least 1 cm before its front edge."""
+    table, front = poses["table"], poses["platform"].position[0] - PLATFORM_DEPTH / 2
+    x = LEG_X * values.get("size:depth", 1.0) + LEG / 2
+    y = LEG_Y * values.get("size:length", 1.0) + LEG / 2
+    corners = [(table @ Pose((a, b, 0.0))).position[0] for a in (-x, x) for b in (-y, y)]
+    return max(corners) < front - 0.01
+
 
 # Hands pitched 45 degrees, down and forward, jaws across the handles.
 _PITCH = Rotation.from_matrix(np.array([[-1, 0, 1], [0, np.sqrt(2), 0], [-1, 0, -1]]) / np.sqrt(2)).as_quat()
-GRIPS = {
-    side: Grip("table", Pose((0.0, y, GRIP_HEIGHT), _PITCH)) for side, y in (("left", HANDLE_Y), ("right", -HANDLE_Y))
-}
 
-TASK = Task(
-    name="table_lift",
-    description="Lift the table with both hands and set it down upright on the platform.",
-    bodies=(BENCH, TABLE, PLATFORM),
-    placements={
-        BENCH.name: BENCH_PLACEMENT,
-        "table": Uniform((0.50, -0.30, 0.0), (0.70, 0.30, 0.0)),
-        "platform": fixed((PLATFORM_X, 0.0, 0.0)),
-    },
-    observed=("table",),
-    primitives=(
-        grasp(GRIPS),
-        move("table", x=0.66, y=0.0),
-        lift("table", height=PLATFORM_HEIGHT + 0.06),
-        extend("table", x=PLATFORM_X, y=0.0),
-        place("table", height=PLATFORM_HEIGHT),
-        retract(),
-    ),
-    success=(
-        upright("table"),
-        at_height("table", PLATFORM_HEIGHT),
-        at_rest("table"),
-        touching("table", "platform"),
-        not_touching("table", ROBOT),
-    ),
-)
+
+def _grip(sign: float) -> Grip:
+    """The handle on the table's left (1) or right (-1)."""
+
+    def pose(scene: Scene) -> Pose:
+        return Pose((0.0, sign * HANDLE_Y * (scene.attributes["table.length"] / WIDTH), GRIP_HEIGHT), _PITCH)
+
+    return Grip("table", pose)
+
+
+GRIPS = {side: _grip(sign) for side, sign in zip(SIDES, (1.0, -1.0), strict=True)}
+HELD = holding(GRIPS)
+
+
+def height_of_platform(scene: Scene) -> float:
+    """Height of the platform's top over the bench, m."""
+    return scene.attributes["platform.height"]
+
+
+def before_platform(scene: Scene) -> float:
+    """Where a table that is square to the world stands, x, m, with its front legs 5 cm before the platform or further."""
+    legs = LEG_X * scene.attributes["table.depth"] / DEPTH + LEG / 2
+    front = scene.objects["platform"].position[0] - PLATFORM_DEPTH / 2
+    return min(MOVED_X, front - legs - 0.05)
+
+
+def platform_x(scene: Scene) -> float:
+    """Where the platform stands, x, m."""
+    return float(scene.objects["platform"].position[0])
+
+
+def platform_y(scene: Scene) -> float:
+    """Where the platform stands, y, m."""
+    return float(scene.objects["platform"].position[1])
+
+
+def _raised(scene: Scene) -> bool:
+    return bool(scene.objects["table"].position[2] > height_of_platform(scene) + 0.01)
+
+
+def _over_platform(scene: Scene) -> bool:
+    offset = scene.objects["table"].position[:2] - scene.objects["platform"].position[:2]
+    return _raised(scene) and math.hypot(*offset) < 0.05
+
+
+RAISED = Need("table raised", _raised)
+OVER_PLATFORM = Need("table over the platform", _over_platform)
+ON_BENCH = stands_at("table", 0.0)
+ON_PLATFORM = stands_at("table", height_of_platform, tolerance=0.015)
+
+
+def make_scene(values: Values) -> Task:
+    """The task for some values of its factors."""
+    length, depth = values.get("size:length", 1.0), values.get("size:depth", 1.0)
+    height, yaw = _platform_height(values), math.radians(values.get("yaw", 0.0))
+    return Task(
+        name="table_lift",
+        description="Lift the table with both hands and set it down upright on the platform.",
+        bodies=(BENCH, _table(values), _platform(values)),
+        placements={
+            BENCH.name: BENCH_PLACEMENT,
+            "table": Uniform((0.50, -0.30, 0.0), (0.70, 0.30, 0.0), yaw),
+            "platform": fixed((PLATFORM_X + values.get("platform:x", 0.0), values.get("platform:y", 0.0), 0.0)),
+        },
+        observed=("table",),
+        also_observed=("platform",),
+        attributes=(("table.length", WIDTH * length), ("table.depth", DEPTH * depth), ("platform.height", height)),
+        primitives=(
+            grasp(GRIPS),
+            move("table", x=before_platform, y=0.0).needing(HELD, ON_BENCH),
+            lift("table", lambda scene: height_of_platform(scene) + 0.06).needing(HELD),
+            extend("table", x=platform_x, y=platform_y, follows=("platform",)).needing(HELD, RAISED),
+            place("table", height_of_platform).needing(HELD),
+            retract().needing(ON_PLATFORM),
+        ),
+        recovery=(retract(),),
+        success=(
+            upright("table"),
+            at_height("table", height),
+            at_rest("table"),
+            touching("table", "platform"),
+            not_touching("table", ROBOT),
+        ),
+        dwell=9,
+        factors=FACTORS,
+        events=EVENTS,
+        vary=make_scene,
+        admissible=admissible,
+    )
+
+
+TASK = make_scene({})

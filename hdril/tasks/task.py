@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from gymnasium.utils.seeding import np_random
 
-from hdril.geometry import Pose
+from hdril.geometry import POSE_AXES, Pose
 from hdril.simulation.bodies import BodySpec
+from hdril.simulation.sensor import SensorSpec
 from hdril.simulation.world import Camera, Physics, World
 from hdril.tasks.conditions import Condition, Measure, Stage, failed
+from hdril.tasks.events import Event, EventSpec
+from hdril.tasks.factors import COMMON, DELAY, POSITION_NOISE, ROTATION_NOISE, Factor, stream
 from hdril.tasks.primitives import Primitive
+from hdril.tasks.scenario import Scenario
 
 DEFAULT_CAMERA = Camera()
 DEFAULT_PHYSICS = Physics()
@@ -20,13 +26,20 @@ DEFAULT_PHYSICS = Physics()
 
 @dataclass(frozen=True)
 class Uniform:
-    """A placement: the body's origin is uniform between two corners (m), its axes those of the world."""
+    """A placement: the body's origin is uniform between two corners (m), and the body is turned by ``yaw`` (rad) about z."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
+    yaw: float = 0.0
+
+    @property
+    def middle(self) -> Pose:
+        """The middle of the area; where the body stands if the placement does not vary."""
+        return Pose(0.5 * (np.array(self.low) + np.array(self.high)))
 
     def sample(self, rng: np.random.Generator) -> Pose:
-        return Pose(rng.uniform(self.low, self.high))
+        half = 0.5 * self.yaw
+        return Pose(rng.uniform(self.low, self.high), (0.0, 0.0, math.sin(half), math.cos(half)))
 
 
 def gym_id(task: str) -> str:
@@ -36,12 +49,45 @@ def gym_id(task: str) -> str:
 
 
 @dataclass(frozen=True)
+class Variation:
+    """How scenes vary: the ranges of the factors that do, and how probable each event is in an episode.
+
+    ``any_event`` is the probability that one more event happens, of a kind that is drawn from all.
+    """
+
+    spans: dict[str, float] = field(default_factory=dict)
+    rates: dict[str, float] = field(default_factory=dict)
+    any_event: float = 0.0
+
+    def __bool__(self) -> bool:
+        return bool(self.spans or self.rates or self.any_event)
+
+    @property
+    def disturbed(self) -> bool:
+        """Whether anything happens to episodes."""
+        return bool(self.rates or self.any_event)
+
+
+NOMINAL = Variation()
+Values = Mapping[str, float]
+"""Values of factors, by key; those that are missing are nominal."""
+PLACEMENTS = 50
+"""Placements that are tried before other values of the factors are drawn."""
+PATIENCE = 3
+"""Horizons that an episode may take in which something may go wrong."""
+
+
+@dataclass(frozen=True)
 class Task:
     """A scene, the primitives that solve it, and what counts as success, as data.
 
     ``bodies`` stand at ``placements[name]`` when an episode starts; those in ``observed`` are in the observation, in
     this order. Success is judged from frame ``horizon`` on, when the primitives are over. ``measures`` and ``stages`` are
     logged at every frame, to show how far a failed episode came. Success itself is the last stage and is not listed.
+
+    Where scenes vary, the task says by ``factors`` what may vary, and ``vary`` gives the task as it is for some values of them:
+    with other bodies, placements, primitives and conditions. ``also_observed`` and ``attributes`` are observed beside
+    ``observed`` then, because they differ from scene to scene.
     """
 
     name: str
@@ -57,10 +103,25 @@ class Task:
     stages: tuple[Stage, ...] = ()
     camera: Camera = DEFAULT_CAMERA
     physics: Physics = DEFAULT_PHYSICS
+    recovery: tuple[Primitive, ...] = ()
+    """What the expert does before it starts again from an earlier primitive, if its hands are near something."""
+    dwell: int = 1
+    """Frames for which success must hold if it comes after the horizon, so that no motion is cut off by the episode's end."""
+    factors: tuple[Factor, ...] = ()
+    events: tuple[EventSpec, ...] = ()
+    vary: Callable[[Values], Task] | None = None
+    also_observed: tuple[str, ...] = ()
+    attributes: tuple[tuple[str, float], ...] = ()
+    """Numbers of bodies that may differ, such as ``("table.width", 0.85)``, m; the name begins with that of the body."""
+    admissible: Callable[[dict[str, Pose], Values], bool] = lambda poses, values: True
+    """Whether a scene that was drawn can be; another is drawn where it cannot."""
+    variation: Variation = NOMINAL
+    detailed: bool = False
+    """Whether ``also_observed`` and ``attributes`` are observed."""
 
     def __post_init__(self) -> None:
         names = [body.name for body in self.bodies]
-        for name in (*self.placements, *self.observed):
+        for name in (*self.placements, *self.observed, *self.also_observed):
             if name not in names:
                 raise ValueError(f"task {self.name}: no body {name!r}; bodies: {', '.join(names)}")
         if missing := set(names) - set(self.placements):
@@ -81,8 +142,76 @@ class Task:
         """Names of the primitives, each once, in the order of their first use: a label is an index into this."""
         return tuple(dict.fromkeys(primitive.name for primitive in self.primitives))
 
+    @property
+    def all_factors(self) -> tuple[Factor, ...]:
+        """What may vary: the task's own factors and those of robot and observation."""
+        return (*self.factors, *COMMON)
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Bodies whose poses are observed, in this order."""
+        return (*self.observed, *(self.also_observed if self.detailed else ()))
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the numbers of ``environment_state``: poses of the objects, then their attributes."""
+        poses = [f"{name}.{axis}" for name in self.objects for axis in POSE_AXES]
+        return (*poses, *(name for name, _ in self.attributes if self.detailed))
+
+    @property
+    def budget(self) -> int:
+        """Frames after which an episode is cut unless it is said otherwise: more than the horizon if something may happen."""
+        return self.horizon * (PATIENCE if self.variation.disturbed else 1)
+
+    def sample(self, seed: int) -> Scenario:
+        """The scene of a seed.
+
+        Each factor and each event has random numbers of its own: the same seed gives the same value, whatever else varies,
+        unless the scene cannot be (:attr:`admissible`); then places are drawn again, and after 50 times values too.
+        """
+        for attempt in range(1000):
+            values = {
+                key: value
+                for factor in self.all_factors
+                if factor.name in self.variation.spans
+                for key, value in factor.draw(self.variation.spans[factor.name], seed, attempt // PLACEMENTS).items()
+            }
+            scene = self.at(values)
+            rng = np_random(seed)[0] if attempt == 0 else stream(seed, "placements", attempt)
+            poses = {body.name: scene.placements[body.name].sample(rng) for body in scene.bodies}
+            if not values or self.admissible(poses, values):
+                vectors = {body: tuple(pose.as_vector().tolist()) for body, pose in poses.items()}
+                return Scenario(self.name, seed, values, vectors, self._sample_events(seed))
+        raise ValueError(f"{self.name}: no scene of 1000 for seed {seed} can be; narrow the ranges")
+
+    def _sample_events(self, seed: int) -> tuple[Event, ...]:
+        rates = self.variation.rates
+        chosen = [s for s in self.events if stream(seed, f"whether {s.name}").uniform() < rates.get(s.name, 0.0)]
+        rng = stream(seed, "any event")
+        if rng.uniform() < self.variation.any_event:
+            chosen.append(self.events[int(rng.integers(len(self.events)))])
+        events = [spec.sample(seed) for spec in dict.fromkeys(chosen)]
+        return tuple(sorted(events, key=lambda event: event.frame))
+
+    def at(self, values: Values) -> Task:
+        """The task as it is for these values of its factors."""
+        own = {key: value for key, value in values.items() if key.partition(":")[0] in {f.name for f in self.factors}}
+        if not own or self.vary is None:
+            return self
+        scene = self.vary(own)
+        return replace(scene, name=self.name, variation=self.variation, detailed=self.detailed)
+
+    @staticmethod
+    def sensor(values: Values) -> SensorSpec:
+        """How well the objects are seen."""
+        return SensorSpec(
+            values.get(POSITION_NOISE.name, 0.0),
+            math.radians(values.get(ROTATION_NOISE.name, 0.0)),
+            round(values.get(DELAY.name, 0.0)),
+        )
+
     def episode_limit(self, frames: int | None, option: str) -> int:
-        """Frames after which an episode is cut: ``frames``, or the horizon if it is None.
+        """Frames after which an episode is cut: ``frames``, or :attr:`budget` if it is None.
 
         Raises:
             ValueError: the episode would be cut before its success is judged; names ``option``, which set ``frames``.
@@ -92,7 +221,7 @@ class Task:
                 f"{option} must be at least {self.horizon}, got {frames}: "
                 f"the success of {self.name} is judged from frame {self.horizon} on"
             )
-        return self.horizon if frames is None else frames
+        return self.budget if frames is None else frames
 
     def read_measures(self, world: World) -> dict[str, float]:
         """The measures by name."""

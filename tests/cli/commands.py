@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 BIN = Path(sys.executable).parent
 REPO = Path(__file__).parents[2]
@@ -38,4 +40,12 @@ def train(dataset: Path, output: Path, *more: str) -> str:
     return succeed(
         "lerobot-train", "--config_path=configs/train/table_lift.yaml", f"--dataset.root={dataset}",
         f"--output_dir={output}", "--batch_size=16", "--num_workers=0", "--log_freq=1", *more,
+    )  # fmt: skip
+
+
+def start(*command: str, **options: Any) -> subprocess.Popen[str]:
+    """Start a command in a session of its own. Ctrl-C reaches it even where the tests run in the background, which ignores it."""
+    return subprocess.Popen(
+        [str(BIN / command[0]), *command[1:]], text=True, start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL), **options,
     )  # fmt: skip

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import hdril.cli.eval
-from tests.cli.commands import BIN, call, refuse, succeed
+from tests.cli.commands import call, refuse, start, succeed
 from tests.evaluation.checkpoints import listing
 
 
@@ -112,7 +112,7 @@ def test_ctrl_c_stops_and_the_same_command_goes_on(checkpoint: Path, tmp_path: P
     command = ["hdril-eval", f"--policy.path={checkpoint}", "--seed=200000", "--num_episodes=6", "--workers=1",
                "--rerun=none", f"--output_dir={tmp_path / 'eval'}"]  # fmt: skip
     journal = tmp_path / "eval.partial/outcomes.jsonl"
-    process = subprocess.Popen([str(BIN / command[0]), *command[1:]], stderr=subprocess.DEVNULL, start_new_session=True)
+    process = start(*command, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 200
     while not (journal.exists() and journal.read_text()) and time.monotonic() < deadline:
         time.sleep(0.02)

@@ -17,17 +17,14 @@ from hdril import __version__
 from hdril.cli.record import RecordConfig, default_root, record_command
 from hdril.demonstrations.provenance import Provenance, Recipe, read_provenance
 from hdril.demonstrations.write import write_dataset
-from tests.cli.commands import BIN, refuse, succeed
+from tests.cli.commands import refuse, start, succeed
 
 
 def test_ctrl_c_stops_cleanly_and_the_same_command_goes_on(tmp_path: Path) -> None:
     """While it records, a second command on the same root is refused."""
     root = tmp_path / "set"
     command = ["hdril-record", f"--root={root}", "--workers=2"]
-    process = subprocess.Popen(
-        [BIN / command[0], *command[1:], "--num_episodes=5000"],
-        stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True,
-    )  # fmt: skip
+    process = start(*command, "--num_episodes=5000", stderr=subprocess.PIPE, stdout=subprocess.PIPE)
     deadline = time.monotonic() + 120
     while not list(tmp_path.glob("set.partial/*.npz")) and time.monotonic() < deadline:
         time.sleep(0.1)

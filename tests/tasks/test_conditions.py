@@ -158,6 +158,7 @@ def test_an_episode_fails_by_each_success_condition_alone(task: str, monkeypatch
         monkeypatch.setattr(env.controller, "apply", lambda commands: None)  # judge the world as it was put
         action = env.controller.observe()
         disturbed.put({}, {}, None)
+        env.frame = env.task_spec.horizon - 1
         _, reward, terminated, _, info = env.step(action)
         assert (reward, terminated, info["is_success"], info["unmet"]) == (1.0, True, True, "")
         missing = {condition.name for condition in env.task_spec.success}

@@ -104,11 +104,11 @@ def test_hole_is_wider_than_the_peg_by_the_clearance() -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("peg_in_hole:width=1", "has no parameter 'width'; it has: clearance, chamfer"),
+        ("peg_in_hole:width=1", "has no parameter 'width'; it has: level, clearance, chamfer, "),
         ("peg_in_hole:clearance=wide", "clearance must be a number, got 'wide'"),
         ("peg_in_hole:clearance=0.5", "clearance must be from 0.0005 to 0.02 m, got 0.5"),
         ("peg_in_hole:chamfer=-1", "chamfer must be from 0 to 0.03 m, got -1"),
-        ("table_lift:clearance=0.005", "table_lift has no parameter 'clearance'; it has: none"),
+        ("table_lift:clearance=0.005", "table_lift has no parameter 'clearance'; it has: level, yaw, "),
     ],
 )
 def test_parameters_are_checked(name: str, message: str) -> None:

@@ -293,7 +293,7 @@ TABLE = SCENE.objects["table"].position
         (lambda: lift("table", height=0.3, frames=6), Pose((TABLE[0], TABLE[1], 0.3)), "lift", 1.0),
         (lambda: extend("table", x=0.9, y=0.05, frames=7), Pose((0.9, 0.05, TABLE[2])), "extend", 1.0),
         (lambda: place("table", height=0.1, frames=8), Pose((TABLE[0], TABLE[1], 0.1)), "place", 0.5),
-        (lambda: carry("spin", "table", lambda pose: pose @ Pose((0, 0, 0), YAWED), 9, jitter=0.7),
+        (lambda: carry("spin", "table", lambda pose, scene: pose @ Pose((0, 0, 0), YAWED), 9, jitter=0.7),
          SCENE.objects["table"] @ Pose((0, 0, 0), YAWED), "spin", 0.7),
     ],
 )  # fmt: skip
@@ -326,7 +326,9 @@ def test_carry_each_takes_each_body_to_its_own_target() -> None:
         same(body_after(primitive, body)[side], goals[body])
     usual = carry_each("connect", held, lambda scene: goals)
     assert [(s.frames, s.jitter, s.rigid) for s in usual.segments] == [(12, 1.0, False)]
-    assert [(s.frames, s.jitter, s.rigid) for s in carry("x", "cup", lambda pose: pose).segments] == [(12, 1.0, True)]
+    assert [(s.frames, s.jitter, s.rigid) for s in carry("x", "cup", lambda pose, scene: pose).segments] == [
+        (12, 1.0, True)
+    ]
 
 
 def test_lift_joined_raises_both_hands_and_presses_them_together() -> None:
