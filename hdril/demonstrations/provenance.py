@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, fields
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hdril import __version__
+from hdril.digest import digest_json
 from hdril.env import BimanualEnv
 from hdril.simulation.robots import ROBOTS
 from hdril.simulation.world import Physics
@@ -25,21 +25,24 @@ RECIPE_PATH = "meta/hdril.json"
 class Recipe:
     """All that makes a demonstration, beside its seed: with both, any episode can be made again, bit for bit.
 
-    ``physics`` is the task's own unless given.
+    ``physics`` is the task's own unless given. ``perturb`` is the standard deviation, m, of noise that the robot's commands get
+    and the recorded actions do not (:class:`~hdril.demonstrations.perturb.PerturbedActor`).
 
     Raises:
-        ValueError: unknown task or robot.
+        ValueError: unknown task or robot, or a perturbation that is out of range.
     """
 
     task: str
     noise: Noise = field(default_factory=Noise)
     physics: Physics | None = None
     robot: str = "baxter"
+    perturb: float = 0.0
 
     def __post_init__(self) -> None:
         task = get_task(self.task)
         if self.robot not in ROBOTS:
             raise ValueError(f"unknown robot {self.robot!r}; choose from: {', '.join(ROBOTS)}")
+        check_perturbation(self.perturb)
         if self.physics is None:
             object.__setattr__(self, "physics", task.physics)
 
@@ -51,9 +54,10 @@ class Recipe:
         """The environment in which the expert demonstrates."""
         return BimanualEnv(self.task, robot=self.robot, physics=self.physics)
 
-    def make_expert(self) -> ScriptedExpert:
+    def make_expert(self) -> Actor:
         """The expert that demonstrates."""
-        return ScriptedExpert(get_task(self.task), self.noise)
+        expert = ScriptedExpert(get_task(self.task), self.noise)
+        return PerturbedActor(expert, self.perturb) if self.perturb else expert
 
 
 @dataclass(frozen=True)
@@ -81,8 +85,7 @@ class Provenance:
 
         Datasets with the same digest hold the same episode for the same seed.
         """
-        text = json.dumps(self.recipe_values, sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(text.encode()).hexdigest()
+        return digest_json(self.recipe_values)
 
 
 def write_provenance(root: Path, provenance: Provenance) -> None:
@@ -114,7 +117,9 @@ def read_provenance(root: Path) -> Provenance | None:
 
 def _provenance(values: object) -> Provenance:
     told = _named(values, "", ("recipe", "seeds", "dropped"))
-    recipe = _named(told["recipe"], "recipe", (*(entry.name for entry in fields(Recipe)), "hdril_version"))
+    since = {"perturb": 0.0}  # fields that datasets of earlier versions do not have
+    recipe = since | told["recipe"] if isinstance(told["recipe"], dict) else told["recipe"]
+    recipe = _named(recipe, "recipe", (*(entry.name for entry in fields(Recipe)), "hdril_version"))
     seeds, dropped = told["seeds"], told["dropped"]
     if not isinstance(seeds, list) or not seeds or not all(type(seed) is int for seed in seeds):
         raise ValueError("seeds must be a list of integers, with one at least")
@@ -122,11 +127,13 @@ def _provenance(values: object) -> Provenance:
         raise ValueError("dropped must be an object of texts by seed")
     for name in ("task", "robot", "hdril_version"):
         _check_type(recipe[name], "", f"recipe.{name}")
+    _check_type(recipe["perturb"], 0.0, "recipe.perturb")
     made = Recipe(
         task=recipe["task"],
         noise=_settings(Noise, recipe["noise"], "recipe.noise"),
         physics=_settings(Physics, recipe["physics"], "recipe.physics"),
         robot=recipe["robot"],
+        perturb=recipe["perturb"],
     )
     return Provenance(made, tuple(seeds), {int(seed): why for seed, why in dropped.items()}, recipe["hdril_version"])
 

@@ -10,8 +10,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hdril.evaluation.identity import PolicyIdentity, digest_json
-from hdril.evaluation.software import digest_file, digest_files, policy_software
+from hdril.digest import digest_file, digest_files, digest_json
+from hdril.evaluation.identity import PolicyIdentity
+from hdril.evaluation.software import policy_software
 
 if TYPE_CHECKING:
     from lerobot.configs.policies import PreTrainedConfig

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from hdril.demonstrations.provenance import read_provenance
+from hdril.digest import SHORT
 from hdril.evaluation.checkpoint import TRAINING, Checkpoint, read_json
-from hdril.evaluation.software import SHORT
 from hdril.tasks import base_name
 
 STATISTICS = "meta/stats.json"

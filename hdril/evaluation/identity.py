@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from hdril.evaluation.software import SHORT, evaluation_software
+from hdril.digest import SHORT
+from hdril.evaluation.software import evaluation_software
 from hdril.tasks import base_name, get_task, task_parameters
 
 Values = Mapping[str, Any]
-
-
-def digest_json(value: Any) -> str:
-    """SHA-256 of canonical JSON: sorted keys, no spaces."""
-    return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hdril.digest import digest_file, digest_json
 from hdril.env import BimanualEnv
-from hdril.evaluation.identity import digest_json
-from hdril.evaluation.software import digest_file, episode_software
+from hdril.evaluation.software import episode_software
 from hdril.files import cache_folder, write_atomically
 from hdril.rollout import Ending
 from hdril.tasks import base_name, task_parameters

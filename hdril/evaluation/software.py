@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import hdril
+from hdril.digest import SHORT, digest_file, digest_files
 from hdril.simulation.robots import ROBOTS
 from hdril.tasks import TASKS
 
@@ -17,20 +17,6 @@ _SCORES = (
     *_EPISODE, "evaluation/evaluate.py", "evaluation/lerobot_actor.py", "evaluation/metrics.py",
     "evaluation/reference.py", "evaluation/score.py",
 )  # fmt: skip
-SHORT = 12
-"""Digits of a digest that people are shown."""
-
-
-def digest_file(path: Path) -> str:
-    """SHA-256 of a file's content."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def digest_files(files: Iterable[Path]) -> str:
-    """SHA-256 of names and contents of files, in the order given."""
-    lines = "".join(f"{digest_file(file)} {file.name}\n" for file in files)
-    return hashlib.sha256(lines.encode()).hexdigest()
 
 
 def _sources(root: Path, parts: Iterable[str]) -> list[Path]:

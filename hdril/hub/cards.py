@@ -13,8 +13,8 @@ from lerobot_policy_hdril.card import CITATION, EVALUATION
 
 from hdril.demonstrations.provenance import RECIPE_PATH, read_provenance
 from hdril.demonstrations.schema import features
+from hdril.digest import SHORT
 from hdril.evaluation.results import headline
-from hdril.evaluation.software import SHORT
 from hdril.markdown import table
 from hdril.tasks import base_name, get_task
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 from huggingface_hub import ModelCard
 
+from hdril.digest import SHORT, digest_file
 from hdril.evaluation.checkpoint import WEIGHTS
 from hdril.evaluation.evaluate import Job, make_job
 from hdril.evaluation.results import headline
-from hdril.evaluation.software import SHORT, digest_file
 from hdril.evaluation.stored import StoredEvaluation
 from hdril.hub.cards import checkpoint_card, folder_of, with_evaluation
 from hdril.hub.publish import download, publish, read_text

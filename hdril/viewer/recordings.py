@@ -8,9 +8,9 @@ from pathlib import Path
 
 import rerun as rr
 
+from hdril.digest import SHORT
 from hdril.evaluation.evaluate import EvaluatedEpisode
 from hdril.evaluation.score import Outcome
-from hdril.evaluation.software import SHORT
 from hdril.viewer.blueprint import blueprint
 from hdril.viewer.keep import keeps
 from hdril.viewer.log import EpisodeLog

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 from hdril.cli.eval import EvalConfig, PolicySource, eval_command
+from hdril.digest import digest_json
 from hdril.evaluation.checkpoint import find_checkpoint, identify, resolve_config
 from hdril.evaluation.evaluate import Job, Worker, make_job
-from hdril.evaluation.identity import Identity, differences, digest_json, identify_trials, require_same
+from hdril.evaluation.identity import Identity, differences, identify_trials, require_same
 from hdril.evaluation.journal import Journal
 from hdril.evaluation.score import Outcome
 from hdril.evaluation.software import episode_software, evaluation_software
