@@ -42,11 +42,19 @@ class Trace:
 
     @property
     def predicted(self) -> NDArray[np.int64]:
-        """(T,), label of the primitive that the planner finds most probable; -1 if there is no planner.
+        """(T,), label of the primitive that the planner finds most probable; -1 if there is no planner, or if it knows none
+        of the task's primitives.
 
         It may differ from :attr:`executed`: the actor asks the planner only when a primitive is over.
         """
-        return np.array([-1 if e is None else int(e.probabilities.argmax()) for e in self.explanations])
+        return np.array([_most_probable(explanation) for explanation in self.explanations])
+
+
+def _most_probable(explanation: Explanation | None) -> int:
+    # Probabilities of primitives that are not the task's are left out: all may be 0, and then argmax means nothing.
+    if explanation is None or not explanation.probabilities.any():
+        return -1
+    return int(explanation.probabilities.argmax())
 
 
 def _contacts(env: BimanualEnv) -> tuple[NDArray[np.float64], dict[str, bool]]:

@@ -183,3 +183,10 @@ def test_a_planner_is_scored_only_if_it_chooses_among_the_tasks_primitives_at_ev
 def test_rounding_of_probabilities_hides_no_planner() -> None:
     rounded = [explanation(0, (0.6, 0.2999, 0.0999))] * 6
     assert score(trace(explanations=rounded)).planner_confusion == [[2, 0, 0], [2, 0, 0], [2, 0, 0]]
+
+
+def test_a_planner_that_knows_none_of_the_tasks_primitives_prefers_none() -> None:
+    """The first primitive is no default: with all probabilities 0 there is no most probable one."""
+    odd = explanation(-1, (0.0, 0.0, 0.0))
+    played = trace(explanations=[odd, explanation(0), None, explanation(2), explanation(0, (0.2, 0.5, 0.3)), odd])
+    assert played.predicted.tolist() == [-1, 0, -1, 2, 1, -1]
