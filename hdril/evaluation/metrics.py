@@ -26,8 +26,11 @@ def dtw_distance(path: NDArray[np.floating | np.integer], reference: NDArray[np.
     """Mean distance along the optimal warping path of (T, D) and (T', D), in the unit of the arguments.
 
     D = 1 / |P*| sum_{(i, j) in P*} |x_i - y_j|, where P* is the warping path from (0, 0) to (T - 1, T' - 1) of least
-    sum. It does not depend on the number of frames: an offset of 1 cm across the direction of motion gives 1 cm. Between paths
-    of equal sum, the one that steps in both indices at once is taken.
+    sum. Between paths of equal sum, the one that steps in both indices at once is taken.
+
+    A constant offset across the direction of motion gives its length, 1 cm for 1 cm, whatever the number of frames. This does not
+    hold for an offset along the motion: warping takes it for a delay, and only the two ends keep it, which weigh less in a
+    longer episode.
 
     Warping as in Sakoe and Chiba (1978), "Dynamic programming algorithm optimization for spoken word recognition", with
     steps of weight 1. The paper of HDR-IL does not define its DTW distance; the two must not be compared.

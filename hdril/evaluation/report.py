@@ -17,8 +17,8 @@ from hdril.tasks import get_task
 PICTURE = "report.png"
 DTW = (
     "DTW is the mean distance along the optimal warping path P* of a hand's positions x and the expert's y, "
-    "D = 1/|P*| Σ_(i,j)∈P* ‖x_i − y_j‖, mean of both hands: it forgives what is early or late, and does not depend on "
-    "the number of frames."
+    "D = 1/|P*| Σ_(i,j)∈P* ‖x_i − y_j‖, mean of both hands: it forgives what is early or late, and an offset across "
+    "the motion counts the same at any number of frames."
 )
 
 
