@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -17,6 +18,7 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot.scripts.lerobot_eval import eval_policy
 from lerobot_policy_hdril import HDRILConfig
 
+from hdril.env import BimanualEnv
 from hdril.lerobot_env import HDRILEnvConfig
 from hdril.simulation.actions import hand_slice
 from hdril.simulation.robots import SIDES
@@ -28,8 +30,8 @@ from hdril.tasks.primitives import Noise
 class Scripted(PreTrainedPolicy):
     """The expert as a LeRobot policy, from observations alone. It never closes its hands on what starts far off."""
 
-    config_class = HDRILConfig  # pyright: ignore
-    name = "scripted"  # pyright: ignore
+    config_class: Any = HDRILConfig
+    name: Any = "scripted"
 
     def __init__(self, task: str) -> None:
         super().__init__(HDRILConfig(device="cpu", push_to_hub=False))
@@ -104,7 +106,8 @@ def test_unknown_choice_of_recordings_is_named() -> None:
 @pytest.mark.parametrize("task", TASKS)
 def test_gym_id_makes_the_task(task: str) -> None:
     env = gym.make(get_task(task).gym_id, disable_env_checker=True)
-    assert env.unwrapped.task == task  # pyright: ignore
+    assert isinstance(env.unwrapped, BimanualEnv)
+    assert env.unwrapped.task == task
     env.close()
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -41,8 +43,9 @@ class Counting:
 
 
 def test_a_frame_is_what_was_seen_before_the_action_and_the_reward_after_it() -> None:
-    env, expert = Counter(), Counting()
-    episode = demonstrate(env, expert, 42)  # pyright: ignore[reportArgumentType]
+    env: Any = Counter()
+    expert = Counting()
+    episode = demonstrate(env, expert, 42)
     assert env.seed == expert.seed == episode.seed == 42
     assert episode.state[:, 0].tolist() == [0, 1, 2]
     assert episode.environment_state[:, 0].tolist() == [0, -1, -2]
@@ -56,5 +59,6 @@ def test_a_frame_is_what_was_seen_before_the_action_and_the_reward_after_it() ->
 
 
 def test_an_actor_without_primitives_cannot_demonstrate() -> None:
+    env: Any = Counter()
     with pytest.raises(ValueError, match="an actor that explains which primitive"):
-        demonstrate(Counter(), ReplayActor(np.zeros((3, 16))), 0)  # pyright: ignore[reportArgumentType]
+        demonstrate(env, ReplayActor(np.zeros((3, 16))), 0)

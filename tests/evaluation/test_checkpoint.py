@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from huggingface_hub.errors import LocalEntryNotFoundError
+from lerobot.policies.act.configuration_act import ACTConfig
 from safetensors.torch import load_file, save_file
 
 from hdril.cli.eval import EvalConfig, PolicySource, eval_command, split_overrides
@@ -92,7 +93,8 @@ def test_options_of_training_cannot_change_an_evaluation(act: Path) -> None:
     ):
         resolve_config(find_checkpoint(str(act)), ("--optimizer_lr=1",))
     config = resolve_config(find_checkpoint(str(act)), ("--n_action_steps=3",))
-    assert config.n_action_steps == 3  # pyright: ignore
+    assert isinstance(config, ACTConfig)
+    assert config.n_action_steps == 3
 
 
 @pytest.mark.parametrize(

@@ -40,11 +40,11 @@ CHOSEN = [0, 2, 3, 5]
 class Wrapped(Dataset):
     """A dataset around a dataset, which tells nothing of its choice of episodes."""
 
-    def __init__(self, inner: Dataset) -> None:
+    def __init__(self, inner: Any) -> None:
         self.inner = inner
 
     def __len__(self) -> int:
-        return len(self.inner)  # pyright: ignore[reportArgumentType]
+        return len(self.inner)
 
     def __getitem__(self, item: int) -> dict[str, torch.Tensor]:
         return {"index": self.inner[item]["index"]}
@@ -57,8 +57,8 @@ LOADERS = {
 }
 
 
-def batches(dataset: Dataset, size: int = 16) -> Iterator[torch.Tensor]:
-    order = torch.randperm(len(dataset), generator=torch.Generator().manual_seed(0))  # pyright: ignore
+def batches(dataset: LeRobotDataset | Wrapped, size: int = 16) -> Iterator[torch.Tensor]:
+    order = torch.randperm(len(dataset), generator=torch.Generator().manual_seed(0))
     for batch in DataLoader(dataset, batch_size=size, sampler=order.tolist()):
         yield batch["index"]
 
@@ -160,8 +160,8 @@ def test_fit_depends_on_the_set_of_episodes_alone(metadata) -> None:
 
 def a_hundred_episodes(known: list[TrainingData]) -> LearnedEpisodes:
     frames = torch.arange(100)
-    stub = SimpleNamespace(episode=frames, index=frames, episode_index=frames.tolist())
-    return LearnedEpisodes(stub, Origin("digest", "hdril/test"), known)  # pyright: ignore[reportArgumentType]
+    stub: Any = SimpleNamespace(episode=frames, index=frames, episode_index=frames.tolist())
+    return LearnedEpisodes(stub, Origin("digest", "hdril/test"), known)
 
 
 def test_fit_follows_when_a_tenth_is_new_or_no_more_come() -> None:

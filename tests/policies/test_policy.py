@@ -102,11 +102,13 @@ def test_policy_explains_itself(metadata) -> None:
 
 
 @pytest.mark.parametrize("coordinates", ["absolute", "relational"])
-def test_plan_undoes_what_the_target_did(coordinates: str, metadata) -> None:
+def test_plan_undoes_what_the_target_did(coordinates: str, metadata, monkeypatch) -> None:
     """If the dynamics predict their targets, the plan is what was recorded: in the world, metres and unit quaternions."""
     policy = build(metadata, coordinates=coordinates).eval()
     window = demonstrations(policy).window(torch.tensor([0, 25, 140]), 0, 12)
-    policy.predict = lambda state, primitive, elapsed: (policy.target(window), state.new_zeros(3))  # pyright: ignore
+    monkeypatch.setattr(
+        policy, "predict", lambda state, primitive, elapsed: (policy.target(window), state.new_zeros(3))
+    )
     plan = policy.plan(window.state, window.primitive, window.elapsed)
     torch.testing.assert_close(plan[window.mask], window.target[window.mask], atol=1e-4, rtol=1e-4)
 
@@ -171,7 +173,7 @@ def test_linear_maps_are_the_ridge_solution(metadata) -> None:
 def test_latent_is_sampled_in_training_and_steady_afterwards(metadata) -> None:
     policy = build(metadata, latent="variational", samples=3, state_skip=False)
     rows = torch.tensor([0, 15])
-    window = demonstrations(policy).window(rows, 0, 12)  # pyright: ignore
+    window = demonstrations(policy).window(rows, 0, 12)
 
     def predict() -> torch.Tensor:
         return policy.predict(window.state, window.primitive, window.elapsed)[0]
@@ -208,7 +210,7 @@ def test_divergence_is_that_of_gaussians(metadata) -> None:
     kept = {}
     model = policy.dynamics[0]
     model.latent.register_forward_hook(lambda module, args, out: kept.update(latent=out.detach()))
-    window = demonstrations(policy).window(torch.tensor([0]), 0, 12)  # pyright: ignore
+    window = demonstrations(policy).window(torch.tensor([0]), 0, 12)
     _, divergence = policy.predict(window.state, window.primitive, window.elapsed)
     mean, log_variance = kept["latent"].chunk(2, dim=-1)
     expected = kl_divergence(Normal(mean, (0.5 * log_variance).exp()), Normal(0.0, 1.0)).sum(-1)
@@ -312,7 +314,7 @@ def test_planner_sees_the_world_whatever_the_dynamics_see(metadata) -> None:
 
 def test_padding_does_not_count(metadata) -> None:
     policy = build(metadata)
-    window = demonstrations(policy).window(torch.tensor([5, 15]), 0, 12)  # pyright: ignore
+    window = demonstrations(policy).window(torch.tensor([5, 15]), 0, 12)
     assert window.mask[0].sum() == 10
     before = policy.dynamics_loss(window)
     window.target[0, 10:] += 100.0

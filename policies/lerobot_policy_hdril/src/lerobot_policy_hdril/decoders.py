@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torchdiffeq import odeint
@@ -59,8 +61,8 @@ class ODEDecoder(nn.Module):
     def forward(self, latent: Tensor, steps: Tensor, stacked: bool = False) -> Tensor:
         """Latent (B, H) and step numbers (B, M) to hidden states (B, M, H)."""
         times = torch.arange(steps.shape[1] + 1, dtype=latent.dtype, device=latent.device) / self.steps
-        path = odeint(lambda _, h: self.gradient(h), latent, times, method="rk4")
-        return path[1:].transpose(0, 1)  # pyright: ignore
+        path: Any = odeint(lambda _, h: self.gradient(h), latent, times, method="rk4")
+        return path[1:].transpose(0, 1)
 
 
 DECODERS: dict[str, type[nn.Module]] = {"gru": GRUDecoder, "ode": ODEDecoder}

@@ -117,11 +117,12 @@ class PrimitiveDynamics(nn.Module):
         )
         self.variational = variational
         self.decoder = DECODERS[decoder](hidden_dim, steps)
-        self.head = nn.Sequential(nn.Linear(2 * hidden_dim, hidden_dim), nn.SiLU(), nn.Linear(hidden_dim, out_dim))
+        first, last = nn.Linear(2 * hidden_dim, hidden_dim), nn.Linear(hidden_dim, out_dim)
+        self.head = nn.Sequential(first, nn.SiLU(), last)
         self.state_skip = StateSkip(len(names), out_dim, steps, stride) if state_skip else None
         if state_skip:  # the network starts from what the linear maps leave: nothing
-            nn.init.zeros_(self.head[-1].weight)  # pyright: ignore
-            nn.init.zeros_(self.head[-1].bias)  # pyright: ignore
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
 
     skip_columns: Tensor
 
@@ -211,10 +212,13 @@ def predict_stacked(
     batched = torch.vmap(one, randomness="same")
     output, divergence = batched(stacked, normalised[rows], raw[rows], context[rows], steps[rows])
     output, divergence = output[group, slot], divergence[group, slot]
-    if used[0].state_skip is None:
+    maps = {
+        k: model.state_skip for k, model in zip(present.tolist(), used, strict=True) if model.state_skip is not None
+    }
+    if not maps:
         return output, divergence
     linear = torch.empty_like(output)
-    for k, model in zip(present.tolist(), used, strict=True):
+    for k, skip in maps.items():
         mine = (which == k).nonzero().squeeze(-1)
-        linear = linear.index_copy(0, mine, model.state_skip(normalised[mine], steps[mine]))  # pyright: ignore
+        linear = linear.index_copy(0, mine, skip(normalised[mine], steps[mine]))
     return output + linear, divergence

@@ -9,6 +9,7 @@ Each module maps a state to an embedding, and tells who attended to whom.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 import torch
@@ -139,7 +140,7 @@ class ObjectAttention(nn.Module):
         return (nodes + F.silu(update)).flatten(1)
 
 
-INTERACTIONS: dict[str, type[nn.Module]] = {
+INTERACTIONS: dict[str, Callable[[list[str], int], Interaction]] = {
     "none": NoInteraction,
     "scalar": ScalarAttention,
     "object": ObjectAttention,
@@ -148,4 +149,4 @@ INTERACTIONS: dict[str, type[nn.Module]] = {
 
 def make_interaction(kind: str, names: list[str], node_dim: int) -> Interaction:
     """The graph of that kind over a state whose numbers have these names."""
-    return INTERACTIONS[kind](names, node_dim)  # pyright: ignore
+    return INTERACTIONS[kind](names, node_dim)

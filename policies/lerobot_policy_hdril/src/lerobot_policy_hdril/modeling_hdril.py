@@ -54,8 +54,9 @@ class HDRILPolicy(PreTrainedPolicy):
         ValueError: no dataset and nothing learned before, or a dataset that does not fit.
     """
 
-    config_class = HDRILConfig  # pyright: ignore
-    name = "hdril"  # pyright: ignore
+    # LeRobot declares both as None.
+    config_class: Any = HDRILConfig
+    name: Any = "hdril"
 
     def __init__(
         self,
@@ -168,9 +169,9 @@ class HDRILPolicy(PreTrainedPolicy):
         for column, buffer in enumerate((self.shortest_length, self.longest_length)):
             buffer.copy_(torch.tensor([run[column] for run in lengths]))
 
-    def get_optim_params(self) -> dict[str, Any]:
-        """All parameters, in one group."""
-        return self.parameters()  # pyright: ignore
+    def get_optim_params(self) -> Any:
+        """All parameters, in one group: LeRobot declares a dict, and takes whatever PyTorch's optimisers take."""
+        return self.parameters()
 
     # ------------------------------------------------------------------ training
 
