@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -138,10 +139,11 @@ def _check_finished(evaluation: StoredEvaluation, config: EvalConfig, job: Job) 
 def _evaluate(config: EvalConfig, job: Job, what: Run, output: Path) -> None:
     against = _read_other(config.against, job)
     journal, start = Journal(output, job.identity), time.monotonic()
-    _play(config, job, journal)
-    outcomes = sorted(journal.done.values(), key=lambda outcome: outcome.seed)
-    summary = write_report(journal.folder, what, outcomes, _compare(outcomes, against))
-    journal.finish()
+    with journal.writing() as add:
+        _play(config, job, journal, add)
+        outcomes = sorted(journal.done.values(), key=lambda outcome: outcome.seed)
+        summary = write_report(journal.folder, what, outcomes, _compare(outcomes, against))
+        journal.finish()
     recordings = sorted((output / "rerun").glob("*.rrd")) if (output / "rerun").exists() else []
     print(f"{headline(summary)}; {time.monotonic() - start:.0f} s")
     print(f"Report: {output / 'report.md'}")
@@ -162,14 +164,13 @@ def _compare(outcomes: list[Outcome], against: StoredEvaluation | None) -> Compa
     return None if against is None else compare(against.results["policy"], outcomes, against.results)
 
 
-def _play(config: EvalConfig, job: Job, journal: Journal) -> None:
+def _play(config: EvalConfig, job: Job, journal: Journal, add: Callable[[Outcome], None]) -> None:
     """Play the seeds that are left, adding to the journal as they come."""
     left = [seed for seed in job.seeds if seed not in journal.done]
     if not left:
         return
     writer = RecordingWriter(journal.folder / "rerun", config.rerun, config.seed) if config.rerun != "none" else None
     with (
-        journal.writing() as add,
         tqdm(total=len(job.seeds), initial=len(journal.done), desc=f"evaluating {job.task}", unit="episode") as bar,
         closing(evaluate(job, left, min(config.workers, len(left)), writer)) as stream,
     ):

@@ -1,4 +1,4 @@
-"""Outcomes of an evaluation that is not finished: written as they come, and gone on with by the same evaluation alone."""
+"""Outcomes of an evaluation that is not finished: kept as they come, so that the same evaluation can go on after a break."""
 
 from __future__ import annotations
 
@@ -13,16 +13,20 @@ from typing import Any
 from hdril.evaluation.checkpoint import read_json
 from hdril.evaluation.identity import Identity, require_same
 from hdril.evaluation.score import Outcome
-from hdril.files import exclusively
+from hdril.files import exclusively, write_atomically
 
 _RUN, _OUTCOMES, _LOCK = "run.json", "outcomes.jsonl", "lock"
 
 
 class Journal:
-    """The folder ``<output>.partial``, which becomes ``output`` when the evaluation is finished.
+    """An unfinished evaluation: the folder ``<output>.partial``, which :meth:`finish` renames to ``output``.
+
+    ``run.json`` holds what is evaluated, ``outcomes.jsonl`` a line for each episode that was played. Nothing is written before
+    :meth:`writing`.
 
     Raises:
-        ValueError: there is an unfinished evaluation of something else; says what differs.
+        ValueError: the folder holds an unfinished evaluation of something else; names what differs.
+        FileExistsError: ``output`` exists, or the folder holds something that is no evaluation.
     """
 
     def __init__(self, output: Path, identity: Identity) -> None:
@@ -30,25 +34,40 @@ class Journal:
         self._identity = identity
         self.done: dict[int, Outcome] = {}
         """Outcomes by seed: those of before, and those that were added."""
+        self._read()
+
+    def _read(self) -> None:
+        if self.output.exists():
+            raise FileExistsError(f"{self.output} exists; choose another output_dir or delete it")
         if (self.folder / _RUN).exists():
             stored = read_json(self.folder / _RUN).get("identity")
-            require_same(str(self.folder), stored, identity.as_dict(), "delete it or choose another output_dir")
+            require_same(str(self.folder), stored, self._identity.as_dict(), "delete it or choose another output_dir")
             self.done = {outcome.seed: outcome for outcome in _read_outcomes(self.folder / _OUTCOMES)}
         elif self.folder.exists() and any(path.name != _LOCK for path in self.folder.iterdir()):
             raise FileExistsError(f"{self.folder} exists and is no evaluation; delete it or choose another output_dir")
 
     @contextmanager
     def writing(self) -> Iterator[Callable[[Outcome], None]]:
-        """Gives a function that adds an outcome. If the evaluation fails before there is one, nothing is left behind.
+        """Gives a function that adds an outcome, and reads :attr:`done` anew. Other processes are kept out until the end.
+
+        If the evaluation fails before there is an outcome, nothing is left behind.
 
         Raises:
             BusyError: another process writes here.
+            ValueError, FileExistsError: as for the class, if another process wrote here since.
         """
         missing = [path for path in self.folder.parents if not path.exists()]
         # A process that is kept out must not remove what the other one writes: the cleaning is done under the lock.
         with exclusively(self.folder, f"evaluating into {self.output}"):
             try:
-                (self.folder / _RUN).write_text(json.dumps({"identity": self._identity.as_dict()}, indent=2))
+                self._read()
+            except (ValueError, FileExistsError):
+                if [path.name for path in self.folder.iterdir()] == [_LOCK]:  # made here, by the lock
+                    self._remove(missing)
+                raise
+            try:
+                run = json.dumps({"identity": self._identity.as_dict()}, indent=2)
+                write_atomically(self.folder / _RUN, lambda file: file.write(run.encode()))
                 with (self.folder / _OUTCOMES).open("a") as file:
 
                     def add(outcome: Outcome) -> None:
@@ -69,7 +88,7 @@ class Journal:
                 path.rmdir()
 
     def finish(self) -> None:
-        """Everything is written: the folder becomes the output."""
+        """Rename the folder to the output: all is written. Call it within :meth:`writing`, which keeps others out."""
         for name in (_RUN, _OUTCOMES, _LOCK):
             (self.folder / name).unlink(missing_ok=True)
         self.folder.replace(self.output)

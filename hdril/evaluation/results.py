@@ -68,7 +68,7 @@ from hdril.tasks import get_task
 
 @dataclass(frozen=True)
 class Run:
-    """What was evaluated: for the report, and to tell whether an interrupted run is the same."""
+    """What was evaluated, for readers of the report. Whether two evaluations are of the same is told by ``identity`` alone."""
 
     task: str
     policy: str

@@ -197,11 +197,57 @@ def test_only_one_process_writes(checkpoint: Path, tmp_path: Path) -> None:
     assert Journal(tmp_path / "eval", identity).done
 
 
+def test_what_another_process_did_in_between_counts(checkpoint: Path, tmp_path: Path) -> None:
+    """Two processes look at the folder before either has the lock: the later one must see what the earlier one wrote."""
+    identity = job_of(checkpoint).identity
+    later, latest = Journal(tmp_path / "eval", identity), Journal(tmp_path / "eval", identity)
+    with Journal(tmp_path / "eval", identity).writing() as add:
+        add(outcome(SEED))
+    with later.writing() as add:
+        assert later.done == {SEED: outcome(SEED)}
+        add(outcome(SEED + 1))
+        later.finish()
+    before = listing(tmp_path)
+    with pytest.raises(FileExistsError, match=r"eval exists; choose another output_dir"), latest.writing():
+        pass
+    assert listing(tmp_path) == before
+
+
 def test_failing_before_the_first_outcome_leaves_nothing(checkpoint: Path, tmp_path: Path) -> None:
     before = listing(tmp_path)
     with pytest.raises(ZeroDivisionError), Journal(tmp_path / "a/b/eval", job_of(checkpoint).identity).writing():
         raise ZeroDivisionError
     assert listing(tmp_path) == before
+
+
+def test_another_evaluation_that_began_in_between_is_left_alone(checkpoint: Path, tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "eval", job_of(checkpoint).identity)
+    with Journal(tmp_path / "eval", job_of(checkpoint, overrides=("--scale=2.0",)).identity).writing() as add:
+        add(outcome(SEED))
+    before = listing(tmp_path)
+    with pytest.raises(ValueError, match=r"eval\.partial holds results of other config"), journal.writing():
+        pass
+    assert listing(tmp_path) == before
+
+
+def test_what_is_evaluated_is_written_whole_or_not_at_all(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk is full while ``run.json`` is written anew: the outcomes of before must not lose what they are of."""
+    identity = job_of(checkpoint).identity
+    with Journal(tmp_path / "eval", identity).writing() as add:
+        add(outcome(SEED))
+    written = (tmp_path / "eval.partial/run.json").read_bytes()
+
+    def replace_fails(*_: object) -> None:
+        raise OSError("no space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.replace", replace_fails)
+        with pytest.raises(OSError, match="no space left"), Journal(tmp_path / "eval", identity).writing():
+            pass
+    assert (tmp_path / "eval.partial/run.json").read_bytes() == written
+    assert not list(tmp_path.rglob("*.tmp"))
 
 
 def test_a_folder_of_something_else_is_left_alone(checkpoint: Path, tmp_path: Path) -> None:
