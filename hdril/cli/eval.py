@@ -126,14 +126,15 @@ def describe(job: Job, held_out: HeldOut) -> Run:
         max_frames=0 if trials.max_frames == task.horizon else trials.max_frames,
         notes=(note,) if foreign else (),
         identity=job.identity.as_dict(),
+        policy_folder=str(job.checkpoint.folder),
     )
 
 
 def _check_finished(evaluation: StoredEvaluation, config: EvalConfig, job: Job) -> None:
     """Raises ValueError unless a finished evaluation is the one that is asked for."""
     evaluation.require(job.identity)
-    if config.against is not None and not evaluation.results.get("comparison"):
-        raise ValueError(f"{evaluation.folder} compares with no other evaluation; evaluate again with --against")
+    if (against := _read_other(config.against, job)) is not None:
+        evaluation.require_comparison(against)
 
 
 def _evaluate(config: EvalConfig, job: Job, what: Run, output: Path) -> None:

@@ -91,6 +91,23 @@ def find_checkpoint(name: str) -> Checkpoint:
     return checkpoint
 
 
+def find_again(name: str, folder: str) -> Checkpoint:
+    """A checkpoint that was used before, from whatever folder the command runs in now.
+
+    Args:
+        name: what the user called it then; a relative path was relative to the folder of that command.
+        folder: where its files were; empty if that was not recorded.
+
+    Raises:
+        As :func:`find_checkpoint`.
+    """
+    if not folder or not (Path(folder) / CONFIG).exists():
+        return find_checkpoint(name)
+    checkpoint = Checkpoint(name, Path(folder))
+    _check_files(checkpoint)
+    return checkpoint
+
+
 def _fetch(repo_id: str) -> Path:
     """The folder of the newest revision of a model's repository, without its results and pictures."""
     from huggingface_hub import snapshot_download

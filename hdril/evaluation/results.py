@@ -8,6 +8,7 @@ key                                   meaning
 ====================================  =================================================================================
 ``task``                              the task with its parameters, as given
 ``policy``                            the checkpoint, as given; for display
+``policy_folder``                     where its files were, links followed, to find it from any folder; empty once published
 ``overrides``                         options of the policy's config that were given, ``--name=value``
 ``first_seed``, ``num_episodes``      the seeds are ``first_seed``, ``first_seed + 1``, …; one episode each
 ``held_out``                          whether the seeds were checked to be apart from the training data; null: cannot be told
@@ -32,7 +33,8 @@ key                                   meaning
 ``planner.confusion``                 frames by the expert's primitive (row) and the preferred one (column), in the order of the
                                       task's labels
 ``comparison``                        against another policy on the same seeds; null if there is none
-``comparison.against``                the other policy
+``comparison.against``                the other policy, as given; for display
+``comparison.against_identity``       what it was, see :class:`hdril.evaluation.identity.PolicyIdentity`
 ``comparison.both``                   seeds on which both policies succeeded
 ``comparison.first_only``             seeds on which this policy alone succeeded
 ``comparison.second_only``            seeds on which the other policy alone succeeded
@@ -85,6 +87,8 @@ class Run:
     """Sentences that a reader of the results must know."""
     identity: dict[str, Any] = field(default_factory=dict)
     """What made the results, see :class:`hdril.evaluation.identity.Identity`."""
+    policy_folder: str = ""
+    """Where the files of the policy are on this machine; empty if that is not known."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,8 @@ class Comparison:
     """The other policy, as reports name it."""
     counts: PairedCounts
     """The first is the policy of the report."""
+    against_identity: dict[str, Any] = field(default_factory=dict)
+    """What the other policy was, see :class:`hdril.evaluation.identity.PolicyIdentity`."""
 
 
 def compare(against: str, outcomes: Iterable[Outcome], other: Mapping[str, Any]) -> Comparison:
@@ -105,7 +111,7 @@ def compare(against: str, outcomes: Iterable[Outcome], other: Mapping[str, Any])
     """
     ours = {outcome.seed: outcome.success for outcome in outcomes}
     theirs = {int(episode["seed"]): bool(episode["success"]) for episode in other["per_episode"]}
-    return Comparison(against, paired_counts(ours, theirs))
+    return Comparison(against, paired_counts(ours, theirs), other["identity"].get("policy", {}))
 
 
 def summarise(run: Run, outcomes: Sequence[Outcome], comparison: Comparison | None = None) -> dict[str, Any]:
@@ -182,6 +188,7 @@ def _compared(comparison: Comparison) -> dict[str, Any]:
     low, high = paired_difference_interval(comparison.counts)
     return {
         "against": comparison.against,
+        "against_identity": comparison.against_identity,
         **asdict(comparison.counts),
         "pc_difference": 100.0 * comparison.counts.difference,
         "pc_difference_ci95": [100.0 * low, 100.0 * high],

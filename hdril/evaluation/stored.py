@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from hdril.evaluation.checkpoint import read_json
+from hdril.evaluation.checkpoint import find_again, read_json
 from hdril.evaluation.evaluate import Job, make_job
 from hdril.evaluation.identity import Identity, TrialsIdentity, differences, require_same
 
@@ -36,6 +36,14 @@ class StoredEvaluation:
         remedy = "compare evaluations of the same task and seeds, by the same software"
         require_same(str(self.folder), self.identity.get("trials"), asdict(trials), remedy)
 
+    def require_comparison(self, other: StoredEvaluation) -> None:
+        """Raises ValueError unless these results are compared with those of ``other``; names what differs."""
+        comparison = self.results.get("comparison")
+        if not comparison:
+            raise ValueError(f"{self.folder} compares with no other evaluation; evaluate again with --against")
+        what = f"the comparison in {self.folder}"
+        require_same(what, comparison.get("against_identity"), other.identity.get("policy") or {}, AGAIN)
+
     def job(self) -> Job:
         """To play any seed again, as it was played then.
 
@@ -47,8 +55,9 @@ class StoredEvaluation:
         if not stored:
             raise ValueError(f"{self.folder} has no record of which weights made its results; evaluate again")
         trials, policy = stored["trials"], stored["policy"]
+        checkpoint = find_again(self.results["policy"], self.results.get("policy_folder", ""))
         job = make_job(
-            self.results["task"], self.results["policy"], trials["first_seed"], trials["num_episodes"],
+            self.results["task"], checkpoint, trials["first_seed"], trials["num_episodes"],
             overrides=tuple(self.results["overrides"]), device=policy["device"], max_frames=trials["max_frames"],
         )  # fmt: skip
         require_same(

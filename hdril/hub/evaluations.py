@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 from huggingface_hub import ModelCard
 
@@ -10,11 +12,12 @@ from hdril.digest import SHORT, digest_file
 from hdril.evaluation.checkpoint import WEIGHTS
 from hdril.evaluation.evaluate import Job, make_job
 from hdril.evaluation.results import headline
-from hdril.evaluation.stored import StoredEvaluation
+from hdril.evaluation.stored import RESULTS, StoredEvaluation
 from hdril.hub.cards import checkpoint_card, folder_of, with_evaluation
 from hdril.hub.publish import download, publish, read_text
 
-FILES = ("results.json", "report.md", "report.png")
+PAGES = ("report.md", "report.png")
+"""What goes up beside ``results.json``."""
 CHECKPOINT_SUFFIXES = (".safetensors", ".json", ".yaml")
 """What LeRobot publishes of a checkpoint: no pickles."""
 
@@ -37,7 +40,8 @@ def publish_evaluation(repo_id: str, job: Job, evaluation: StoredEvaluation, pri
     """
     _check_unchanged(job, evaluation)
     summary = evaluation.results
-    files: dict[str, Path | bytes] = {f"{folder_of(summary)}/{name}": evaluation.folder / name for name in FILES}
+    files: dict[str, Path | bytes] = {f"{folder_of(summary)}/{name}": evaluation.folder / name for name in PAGES}
+    files[f"{folder_of(summary)}/{RESULTS}"] = _portable(summary)
     text = read_text(repo_id, "README.md", "model")
     if Path(job.checkpoint.name).is_dir():
         content = sorted(job.checkpoint.folder.iterdir())
@@ -48,6 +52,11 @@ def publish_evaluation(repo_id: str, job: Job, evaluation: StoredEvaluation, pri
     card = with_evaluation(ModelCard(text or f"# {repo_id}\n"), summary, repo_id)
     files["README.md"] = str(card).encode()
     return publish(repo_id, "model", files, headline(summary), private)
+
+
+def _portable(summary: dict[str, Any]) -> bytes:
+    """``results.json`` without what is of this machine alone: where the checkpoint lies."""
+    return json.dumps(summary | {"policy_folder": ""}, indent=2).encode()
 
 
 def _check_unchanged(job: Job, evaluation: StoredEvaluation) -> None:

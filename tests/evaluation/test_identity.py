@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import shutil
 import sys
 from dataclasses import replace
 from importlib.metadata import version
@@ -51,17 +52,20 @@ def outcome(seed: int, success: bool = True) -> Outcome:
     return Outcome(seed, success, "", 70, 0, 0.1, 0.01, 0.1, {"grasp": 0.1}, (0.5, 0.0), primitives=("grasp",))
 
 
-def finish(job: Job, output: Path, success: bool = True) -> Path:
+def finish(job: Job, output: Path, success: bool = True, against: Path | None = None) -> Path:
     """An evaluation as it lies on disk when it is finished, made without playing."""
     from hdril.cli.eval import describe
     from hdril.evaluation.held_out import HeldOut
     from hdril.evaluation.report import write_report
+    from hdril.evaluation.results import compare
 
     journal = Journal(output, job.identity)
     with journal.writing() as add:
         for seed in job.seeds:
             add(outcome(seed, success))
-    write_report(journal.folder, describe(job, HeldOut(None, "it is a test")), list(journal.done.values()))
+    outcomes = list(journal.done.values())
+    other = None if against is None else compare("other", outcomes, read_evaluation(against).results)
+    write_report(journal.folder, describe(job, HeldOut(None, "it is a test")), outcomes, other)
     journal.finish()
     return output
 
@@ -313,6 +317,50 @@ def test_comparison_needs_the_same_trials(checkpoint: Path, tmp_path: Path) -> N
     ):
         eval_command(config)
     assert listing(tmp_path) == before
+
+
+def test_a_finished_comparison_is_with_a_policy_not_with_a_path(checkpoint: Path, tmp_path: Path) -> None:
+    """The other policy was trained and evaluated anew at the same place: the comparison of before is not with that one."""
+    other = save_replay(tmp_path / "other", STILL + 0.25)
+    others = finish(job_of(other), tmp_path / "others", success=False)
+    output = finish(job_of(checkpoint), tmp_path / "eval", against=others)
+    stored = read_evaluation(output)
+    stored.require_comparison(read_evaluation(others))
+    config = EvalConfig(
+        PolicySource(str(checkpoint)), num_episodes=2, seed=SEED, output_dir=output, against=others, push="a/b"
+    )
+    shutil.rmtree(others)
+    save_replay(other, STILL + 0.5)
+    finish(job_of(other), others, success=False)
+    with pytest.raises(
+        ValueError,
+        match=r"the comparison in .*eval holds results of other weights \(\w{12} there, \w{12} here\); evaluate",
+    ):
+        eval_command(config)
+    with pytest.raises(ValueError, match="others compares with no other evaluation; evaluate again with --against"):
+        read_evaluation(others).require_comparison(stored)
+
+
+def test_a_checkpoint_is_found_again_from_another_folder(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``last`` was given by a relative path. Later the command runs elsewhere, and training has moved the link."""
+    monkeypatch.chdir(tmp_path)
+    name = str(checkpoint.relative_to(tmp_path))
+    job = make_job("table_lift", name, SEED, 2)
+    stored = read_evaluation(finish(job, tmp_path / "eval"))
+    save_replay(tmp_path / "checkpoints/000200/pretrained_model", STILL + 0.25)
+    (tmp_path / "checkpoints/last").unlink()
+    (tmp_path / "checkpoints/last").symlink_to("000200")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert stored.job() == job
+    shutil.rmtree(checkpoint.parents[1] / "000100")
+    with pytest.raises(FileNotFoundError, match=f"no checkpoint at {name}"):
+        stored.job()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"other weights .* is no longer the one that was evaluated"):
+        stored.job()
 
 
 def test_replaying_needs_the_evaluated_checkpoint(checkpoint: Path, tmp_path: Path) -> None:

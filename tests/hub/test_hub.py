@@ -155,6 +155,12 @@ def test_local_checkpoint_is_published_with_its_results(hub: FakeHub, checkpoint
     assert repository.commits == 1
     assert repository.files["model.safetensors"] == (checkpoint / "model.safetensors").read_bytes()
     card = repository.files["README.md"].decode()
+    here, published = (json.loads(text) for text in (
+        (tmp_path / "eval/results.json").read_text(), repository.files["eval/table_lift_700001/results.json"],
+    ))  # fmt: skip
+    assert here.pop("policy_folder") == str(checkpoint.resolve())
+    assert published.pop("policy_folder") == ""
+    assert published == here
     assert "--policy.path=user/local" in card
     assert "The seeds are held out: compared with the seeds of the training data, recipe" in card
 
