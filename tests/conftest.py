@@ -18,6 +18,7 @@ from filelock import FileLock
 from hdril.demonstrations.episode import Episode
 from hdril.demonstrations.provenance import Recipe
 from hdril.demonstrations.record import record
+from hdril.tasks import TASKS
 
 POLICY_FOLDERS = {"policies", "viewer"}
 """Folders whose tests involve a policy."""
@@ -66,15 +67,18 @@ def made_up() -> Callable[..., Episode]:
 
     def make(seed: int, frames: int = 12, success: bool = True, label: list[int] | None = None) -> Episode:
         rng = np.random.default_rng(seed)
+        labels = np.array(label) if label else np.arange(frames) * 6 // frames
         return Episode(
             seed=seed,
             state=rng.normal(size=(frames, 16)).astype(np.float32),
             environment_state=rng.normal(size=(frames, 7)).astype(np.float32),
             action=rng.normal(size=(frames, 16)).astype(np.float32),
-            label=np.array(label) if label else np.arange(frames) * 6 // frames,
+            label=labels,
+            start=np.diff(labels, prepend=-1) != 0,
             reward=rng.uniform(size=frames).astype(np.float32),
             success=success,
             unmet="" if success else "table upright",
+            scenario=TASKS["table_lift"].sample(seed).to_json(),
         )
 
     return make

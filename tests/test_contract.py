@@ -31,6 +31,7 @@ def test_names_that_both_write_down_agree() -> None:
     assert policy_schema.SUBTASKS_PATH == schema.SUBTASKS_PATH
     assert policy_schema.RECIPE_PATH == schema.RECIPE_PATH
     assert policy_schema.SUBTASK_KEY == schema.SUBTASK
+    assert policy_schema.SUBTASK_START == schema.SUBTASK_START
 
 
 def test_the_policy_makes_nodes_of_hands_and_objects(metadata: LeRobotDatasetMetadata) -> None:

@@ -15,6 +15,7 @@ from hdril import __version__
 from hdril.cli.common import check_repo_id, run
 from hdril.demonstrations.provenance import Recipe, read_provenance
 from hdril.demonstrations.record import record
+from hdril.tasks import ANY_EVENT, TASKS, base_name
 from hdril.tasks.primitives import Noise
 
 
@@ -29,8 +30,13 @@ class RecordConfig:
     """Name of the dataset on the Hugging Face Hub, as user/name. Only --push needs it: a dataset that stays here has no name,
     and --dataset.repo_id of LeRobot's commands may be any beside --dataset.root."""
     task: str = "table_lift"
-    """Name of the task, with its parameters if it has any (peg_in_hole:clearance=0.004); an unknown one is answered with
-    those there are."""
+    """Name of the task, with its parameters if it has any (peg_in_hole:clearance=0.004, table_lift:level=varied); an unknown one
+    is answered with those there are."""
+    events: str = ""
+    """What happens to the demonstrations: names of the task's events with their probability in an episode
+    (push=0.3,open_hand=0.2), any_event=0.5 for one of all. The expert mends what it can, and what it cannot is dropped."""
+    perturb: float = 0.0
+    """Standard deviation, m, of noise that the robot gets at every frame and the recorded action does not."""
     num_episodes: int = 100
     """Successful episodes to record."""
     seed: int = 0
@@ -55,14 +61,32 @@ def record_command(config: RecordConfig) -> None:
         check_repo_id("repo_id", config.repo_id)
     elif config.push:
         raise ValueError("--push needs --repo_id: the name of the dataset on the Hub, as user/name")
-    recipe = Recipe(config.task, config.noise)
-    root = config.root or default_root(config.task, config.repo_id)
+    recipe = Recipe(with_events(config.task, config.events), config.noise, perturb=config.perturb)
+    root = config.root or default_root(recipe.task, config.repo_id)
     if config.push and root.exists():
         _check_same(root, recipe, config)
     else:
         _record(recipe, config, root)
     if config.push and config.repo_id is not None:
         _push(config.repo_id, config, root)
+
+
+def with_events(task: str, events: str) -> str:
+    """The task's name with the probabilities of ``events`` among its parameters.
+
+    Raises:
+        ValueError: something that is no event of the task; names those there are.
+    """
+    if not events:
+        return task
+    base = base_name(task)
+    known = (*(event.name for event in TASKS.find(base).events), ANY_EVENT)
+    for item in events.split(","):
+        name = item.partition("=")[0]
+        if name not in known or known == (ANY_EVENT,):
+            has = ", ".join(known) if len(known) > 1 else "none"
+            raise ValueError(f"{base} has no event {name!r}; it has: {has}")
+    return f"{task}{',' if ':' in task else ':'}{events}"
 
 
 def default_root(task: str, repo_id: str | None) -> Path:

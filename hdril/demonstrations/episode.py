@@ -22,9 +22,12 @@ class Episode:
     environment_state: NDArray[np.float32]  # (T, 7 per object)
     action: NDArray[np.float32]  # (T, 16)
     label: NDArray[np.int64]  # (T,)
+    start: NDArray[np.bool_]  # (T,), whether a primitive starts at this frame
     reward: NDArray[np.float32]  # (T,)
     success: bool
     unmet: str
+    scenario: str
+    """The scene and what happened to it, as JSON (:class:`hdril.tasks.scenario.Scenario`)."""
 
     def __len__(self) -> int:
         return len(self.action)
@@ -35,6 +38,7 @@ class EpisodeRecorder:
 
     def begin(self, env: BimanualEnv, observation: Observation, info: dict[str, Any]) -> None:
         self._transitions: list[Transition] = []
+        self._scenario = env.scenario.to_json()
 
     def observe(self, transition: Transition) -> None:
         """Add a frame."""
@@ -56,9 +60,11 @@ class EpisodeRecorder:
             environment_state=np.stack([t.observation["environment_state"] for t in self._transitions]),
             action=np.stack([t.decision.action for t in self._transitions]),
             label=np.array([e.primitive for e in explanations if e is not None], np.int64),
+            start=np.array([e.starts for e in explanations if e is not None]),
             reward=np.array([t.reward for t in self._transitions], np.float32),
             success=bool(last["is_success"]),
             unmet=str(last["unmet"]),
+            scenario=self._scenario,
         )
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from hdril import __version__
+from hdril.actor import Actor
+from hdril.demonstrations.perturb import PerturbedActor, check_perturbation
 from hdril.digest import digest_json
 from hdril.env import BimanualEnv
 from hdril.simulation.robots import ROBOTS

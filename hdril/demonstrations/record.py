@@ -11,6 +11,7 @@ from functools import cache
 from itertools import islice
 from pathlib import Path
 
+from hdril.actor import Actor
 from hdril.demonstrations.episode import Episode, demonstrate
 from hdril.demonstrations.provenance import Provenance, Recipe
 from hdril.demonstrations.shards import Shards
@@ -18,7 +19,6 @@ from hdril.demonstrations.write import write_dataset
 from hdril.env import BimanualEnv
 from hdril.errors import UserError
 from hdril.files import MAX_SEED, exclusively
-from hdril.tasks.expert import ScriptedExpert
 from hdril.workers import worker_pool
 
 PATIENCE = 20
@@ -30,7 +30,7 @@ class ExpertError(UserError):
 
 
 @cache
-def _stage(recipe: Recipe) -> tuple[BimanualEnv, ScriptedExpert]:
+def _stage(recipe: Recipe) -> tuple[BimanualEnv, Actor]:
     """What a worker process needs, made for its first episode."""
     return recipe.make_env(), recipe.make_expert()
 

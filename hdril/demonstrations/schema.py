@@ -8,21 +8,25 @@ from __future__ import annotations
 from typing import Any
 
 from hdril.demonstrations.provenance import RECIPE_PATH, Recipe
-from hdril.geometry import POSE_AXES
 from hdril.simulation.actions import ACTION_NAMES
 from hdril.tasks import get_task
 
 STATE = "observation.state"
 """(16,): measured hand poses and openings, :data:`~hdril.simulation.actions.ACTION_NAMES`."""
 ENVIRONMENT_STATE = "observation.environment_state"
-"""(7 per observed object): poses of the objects, named ``<object>.<axis>``."""
+"""Poses of the observed objects, 7 numbers each, named ``<object>.<axis>``; where scenes vary, also the objects' attributes,
+named ``<object>.<attribute>``."""
 ACTION = "action"
 """(16,): commanded hand poses and openings, named as :data:`STATE`."""
 SUBTASK = "subtask_index"
 """Label of a frame: the primitive that the expert executes, an index into :data:`SUBTASKS_PATH`."""
+SUBTASK_START = "subtask_start"
+"""Whether a primitive starts at this frame: tells a primitive that is played twice from one that goes on."""
 REWARD, SUCCESS, DONE = "next.reward", "next.success", "next.done"
 SEED = "seed"
 """Column of ``meta/episodes``: the seed of the episode."""
+SCENARIO = "scenario"
+"""Column of ``meta/episodes``: the scene and its events, as JSON (:class:`hdril.tasks.scenario.Scenario`)."""
 
 SUBTASKS_PATH = "meta/subtasks.parquet"
 """Names of the primitives, by label."""
@@ -36,10 +40,12 @@ __all__ = [
     "PROPORTIONS_PATH",
     "RECIPE_PATH",
     "REWARD",
+    "SCENARIO",
     "SEED",
     "STATE",
     "SUBTASK",
     "SUBTASKS_PATH",
+    "SUBTASK_START",
     "SUCCESS",
     "features",
 ]
@@ -47,7 +53,7 @@ __all__ = [
 
 def features(recipe: Recipe) -> dict[str, dict[str, Any]]:
     """Features of the dataset, as LeRobot declares them."""
-    objects = [f"{name}.{axis}" for name in get_task(recipe.task).observed for axis in POSE_AXES]
+    objects = list(get_task(recipe.task).state_names)
 
     def vector(names: list[str]) -> dict[str, Any]:
         return {"dtype": "float32", "shape": (len(names),), "names": names}
@@ -60,6 +66,7 @@ def features(recipe: Recipe) -> dict[str, dict[str, Any]]:
         ENVIRONMENT_STATE: vector(objects),
         ACTION: vector(list(ACTION_NAMES)),
         SUBTASK: scalar("int64"),
+        SUBTASK_START: scalar("bool"),
         REWARD: scalar("float32"),
         SUCCESS: scalar("bool"),
         DONE: scalar("bool"),

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import fields
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -56,9 +57,10 @@ class Shards:
 def _load(path: Path, seed: int) -> Episode:
     # np.load leaves a file that it opened itself open when it fails.
     with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-        values = {field.name: data[field.name] for field in fields(Episode)}
+        values: dict[str, Any] = {field.name: data[field.name] for field in fields(Episode)}
     if values["seed"] != seed:
         raise ValueError(f"it holds seed {values['seed']}")
     if len({len(value) for value in values.values() if value.ndim}) != 1:
         raise ValueError("its arrays differ in length")
-    return Episode(**values | {"seed": seed, "success": bool(values["success"]), "unmet": str(values["unmet"])})
+    texts: dict[str, Any] = {name: str(values[name]) for name in ("unmet", "scenario")}
+    return Episode(**values | texts | {"seed": seed, "success": bool(values["success"])})

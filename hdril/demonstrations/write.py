@@ -16,9 +16,11 @@ from hdril.demonstrations.schema import (
     ENVIRONMENT_STATE,
     PROPORTIONS_PATH,
     REWARD,
+    SCENARIO,
     SEED,
     STATE,
     SUBTASK,
+    SUBTASK_START,
     SUBTASKS_PATH,
     SUCCESS,
     features,
@@ -45,7 +47,7 @@ def write_dataset(root: Path, provenance: Provenance, episodes: list[Episode]) -
     metadata.save_episode_tasks([task.description])
     _write_episodes(metadata, task, episodes)
     metadata.finalize()
-    _write_names(root, task)
+    _write_names(root, task, episodes)
     write_provenance(root, provenance)
 
 
@@ -68,12 +70,12 @@ def _write_episodes(metadata: Any, task: Task, episodes: list[Episode]) -> None:
             writer.write_table(table)
             values: dict[str, list[str] | np.ndarray] = {key: frames[key] for key in metadata.features}
             stats = compute_episode_stats(values, metadata.features)
-            row = place | {SEED: episode.seed} | _segments(episode, task.labels)
+            row = place | {SEED: episode.seed, SCENARIO: episode.scenario} | _segments(episode, task.labels)
             metadata.save_episode(index, len(episode), [task.description], stats, row)
             start += len(episode)
 
 
-def _write_names(root: Path, task: Task) -> None:
+def _write_names(root: Path, task: Task, episodes: list[Episode]) -> None:
     """The names of task and primitives, and the primitives' shares of an episode."""
     import pandas as pd
 
@@ -82,7 +84,8 @@ def _write_names(root: Path, task: Task) -> None:
     tasks.to_parquet(root / "meta/tasks.parquet")
     subtasks = pd.DataFrame({SUBTASK: range(len(task.labels))}, index=pd.Index(task.labels, name="subtask"))
     subtasks.to_parquet(root / SUBTASKS_PATH)
-    shares = {name: sum(p.frames for p in task.primitives if p.name == name) / task.horizon for name in task.labels}
+    played = np.concatenate([episode.label for episode in episodes])
+    shares = {name: float((played == label).mean()) for label, name in enumerate(task.labels)}
     (root / PROPORTIONS_PATH).write_text(json.dumps(shares, indent=2))
 
 
@@ -95,6 +98,7 @@ def _frames(episode: Episode, index: int, start: int, fps: int) -> dict[str, np.
         ENVIRONMENT_STATE: episode.environment_state,
         ACTION: episode.action,
         SUBTASK: episode.label,
+        SUBTASK_START: episode.start,
         REWARD: episode.reward,
         SUCCESS: last & episode.success,
         DONE: last,
@@ -107,8 +111,8 @@ def _frames(episode: Episode, index: int, start: int, fps: int) -> dict[str, np.
 
 
 def _segments(episode: Episode, labels: tuple[str, ...]) -> dict[str, Any]:
-    """The primitives as runs of equal labels, in the columns that LeRobot's SARM reads (ends included)."""
-    starts = np.flatnonzero(np.diff(episode.label, prepend=-1))
+    """The primitives from each start to the next, in the columns that LeRobot's SARM reads (ends included)."""
+    starts = np.flatnonzero(episode.start)
     ends = np.append(starts[1:], len(episode)) - 1
     return {
         "dense_subtask_names": [labels[label] for label in episode.label[starts]],

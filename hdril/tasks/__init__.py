@@ -39,7 +39,19 @@ def _read(module: object) -> Task:
     task = getattr(module, "TASK", None)
     if not isinstance(task, Task):
         raise TypeError(f"{getattr(module, '__name__', module)} defines no TASK of type hdril.tasks.Task")
+    _check_builder(getattr(module, "__name__", module), getattr(module, "make_task", None))
     return task
+
+
+def _check_builder(module: object, build: object) -> None:
+    """Raises TypeError unless ``make_task``, if there is one, can be called with numbers by name."""
+    if build is None:
+        return
+    if not callable(build):
+        raise TypeError(f"{module} has a make_task that is no function")
+    for name, entry in signature(build).parameters.items():
+        if not isinstance(entry.default, int | float):
+            raise TypeError(f"{module} has a make_task whose parameter {name!r} has no number as its default")
 
 
 TASKS: Registry[Task] = Registry("task", "hdril.tasks", _discover(), _read)

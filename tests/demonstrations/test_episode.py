@@ -9,6 +9,7 @@ import pytest
 
 from hdril.actor import Decision, Explanation, ReplayActor
 from hdril.demonstrations.episode import demonstrate
+from hdril.tasks.scenario import Scenario
 
 
 class Counter:
@@ -20,8 +21,9 @@ class Counter:
             "environment_state": np.full(7, -self.steps, np.float32),
         }
 
-    def reset(self, *, seed: int):
+    def reset(self, *, seed: int, options: None = None):
         self.seed, self.steps = seed, 0
+        self.scenario = Scenario("count", seed, {}, {})
         return self._observation(), {}
 
     def step(self, action):

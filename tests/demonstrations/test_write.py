@@ -19,15 +19,18 @@ from hdril.demonstrations.write import write_dataset
 from hdril.simulation.actions import ACTION_NAMES, hand_poses
 from hdril.simulation.robots import SIDES
 from hdril.tasks import TASKS
+from hdril.tasks.scenario import Scenario
 
 Written = tuple[Path, list[Episode]]
 
 
 @pytest.fixture(scope="module")
 def written(made_up: Callable[..., Episode], tmp_path_factory: pytest.TempPathFactory) -> Written:
-    """Two episodes of different lengths; the second plays a primitive twice."""
+    """Two episodes of different lengths; the second plays a primitive three times, twice in a row."""
     root = tmp_path_factory.mktemp("written") / "set"
-    episodes = [made_up(7), made_up(9, frames=5, label=[1, 1, 0, 1, 1])]
+    again = made_up(9, frames=5, label=[1, 1, 0, 1, 1])
+    again.start[4] = True
+    episodes = [made_up(7), again]
     write_dataset(root, Provenance(Recipe("table_lift"), (7, 9), {8: "table upright"}), episodes)
     return root, episodes
 
@@ -47,7 +50,7 @@ def test_columns_are_what_was_demonstrated(written: Written) -> None:
     data = pd.read_parquet(root / "data")
     columns = {
         "observation.state": "state", "observation.environment_state": "environment_state", "action": "action",
-        "subtask_index": "label", "next.reward": "reward",
+        "subtask_index": "label", "subtask_start": "start", "next.reward": "reward",
     }  # fmt: skip
     for column, field in columns.items():
         expected = np.concatenate([getattr(episode, field) for episode in episodes])
@@ -64,18 +67,24 @@ def test_lerobot_reads_it_with_its_statistics(written: Written) -> None:
     assert [row["seed"] for row in loaded.meta.episodes] == [7, 9]
 
 
-def test_segments_are_runs_of_a_label_ends_included(written: Written) -> None:
+def test_segments_go_from_start_to_start_ends_included(written: Written) -> None:
     row = LeRobotDataset("any/name", root=written[0]).meta.episodes[1]
-    assert row["dense_subtask_names"] == ["move", "grasp", "move"]
-    assert row["dense_subtask_start_frames"] == [0, 2, 3]
-    assert row["dense_subtask_end_frames"] == [1, 2, 4]
+    assert row["dense_subtask_names"] == ["move", "grasp", "move", "move"]
+    assert row["dense_subtask_start_frames"] == [0, 2, 3, 4]
+    assert row["dense_subtask_end_frames"] == [1, 2, 3, 4]
+
+
+def test_every_episode_comes_with_its_scenario(written: Written) -> None:
+    rows = LeRobotDataset("any/name", root=written[0]).meta.episodes
+    scenarios = [Scenario.from_json(row["scenario"]) for row in rows]
+    assert scenarios == [TASKS["table_lift"].sample(seed) for seed in (7, 9)]
 
 
 def test_shares_of_the_primitives(written: Written) -> None:
     task = TASKS["table_lift"]
     shares = json.loads((written[0] / PROPORTIONS_PATH).read_text())
     assert list(shares) == list(task.labels)
-    assert shares["grasp"] == pytest.approx(10 / 70)
+    assert shares["grasp"] == pytest.approx(3 / 17)
     assert sum(shares.values()) == pytest.approx(1.0)
 
 

@@ -21,7 +21,7 @@ import torch
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
-from lerobot_policy_hdril.schema import SUBTASK_KEY, SUBTASKS_PATH
+from lerobot_policy_hdril.schema import SUBTASK_KEY, SUBTASK_START, SUBTASKS_PATH
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -71,7 +71,9 @@ def _read_columns(root: Path, subtask_key: str) -> dict[str, np.ndarray]:
     if not files:
         raise ValueError(f"{root} holds no data/*/*.parquet")
     keys = [OBS_STATE, OBS_ENV_STATE, ACTION, subtask_key, "index", "episode_index"]
-    table = parquet.ParquetDataset(files).read(columns=keys)
+    source = parquet.ParquetDataset(files)
+    marked = subtask_key == SUBTASK_KEY and SUBTASK_START in source.schema.names
+    table = source.read(columns=[*keys, *([SUBTASK_START] if marked else [])])
     table = table.take(np.argsort(table.column("index").to_numpy(), kind="stable"))
     columns = {
         "state": np.concatenate([_matrix(table, OBS_STATE), _matrix(table, OBS_ENV_STATE)], axis=1),
@@ -80,6 +82,8 @@ def _read_columns(root: Path, subtask_key: str) -> dict[str, np.ndarray]:
         "index": table.column("index").to_numpy().astype(np.int64),
         "episode_index": table.column("episode_index").to_numpy().astype(np.int64),
     }
+    if marked:
+        columns["start"] = table.column(SUBTASK_START).to_numpy().astype(bool)
     if not all(np.isfinite(columns[key]).all() for key in ("state", "action")):
         raise ValueError(f"{root} holds states or actions that are not finite")
     return columns
@@ -127,6 +131,8 @@ class Demonstrations:
         self.digest = _digest(columns, self.primitives)
         new_episode = np.diff(columns["episode_index"], prepend=-1) != 0
         new_segment = new_episode | (np.diff(columns["label"], prepend=-1) != 0)
+        if "start" in columns:
+            new_segment |= columns["start"]
         self.episode_index: list[int] = columns["episode_index"][new_episode].tolist()
         """What the dataset calls each episode."""
         self.index, self.state, self.action, self.label, self.episode, self.segment = (

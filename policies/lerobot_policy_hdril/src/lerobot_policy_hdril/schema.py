@@ -10,6 +10,8 @@ PART_SUFFIXES = ("_ee", "_gripper")
 
 SUBTASK_KEY = "subtask_index"
 """Column that labels each frame with its primitive, unless ``policy.subtask_key`` names another."""
+SUBTASK_START = "subtask_start"
+"""Column that is true where a primitive starts. Without it, a primitive starts where the label changes."""
 SUBTASKS_PATH = "meta/subtasks.parquet"
 """Names of the primitives, by label."""
 RECIPE_PATH = "meta/hdril.json"
