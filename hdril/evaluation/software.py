@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, entry_points, version
+from importlib.util import find_spec
+from itertools import accumulate
 from pathlib import Path
 
 import hdril
 from hdril.digest import SHORT, digest_file, digest_files
 from hdril.simulation.robots import ROBOTS
-from hdril.tasks import TASKS
 
 _EPISODE = ("actor.py", "env.py", "geometry.py", "rollout.py", "simulation", "tasks", "trace.py")
 _SCORES = (
@@ -45,11 +46,43 @@ def _robot_model(robot: str) -> str:
 
 
 def _task_source(task: str) -> dict[str, str]:
-    """Digest of the module of a task from another package; the sources of this one have their own."""
-    module = TASKS.source(task)
-    if getattr(module, "__name__", "").startswith(f"{hdril.__name__}.") or not getattr(module, "__file__", None):
-        return {}
-    return {f"source of {task}": digest_file(Path(module.__file__))[:SHORT]}
+    """Digest of the package that a task's entry point names; the tasks of hdril are in the digest of hdril.
+
+    Raises:
+        ValueError: the files of the package cannot be read.
+    """
+    claims = entry_points(group="hdril.tasks", name=task)
+    return {f"source of {task}": _plugin_digest(task, claim.module) for claim in claims}
+
+
+@cache
+def _plugin_digest(task: str, module: str) -> str:
+    try:
+        return digest_files(_package_files(module))[:SHORT]
+    except OSError:
+        raise ValueError(
+            f"the task {task!r} comes from {module}, whose files cannot be read: no record could tell which task it was"
+        ) from None
+
+
+def _package_files(module: str) -> list[Path]:
+    """The files of the outermost package that holds a module, without bytecode; the module's own if it is in none.
+
+    All of them count, because a scene may be made of meshes and tables of numbers, too. Namespace packages are passed over:
+    they belong to several distributions.
+
+    Raises:
+        FileNotFoundError: there are no files, such as for a package in an archive.
+    """
+    names = accumulate(module.split("."), "{}.{}".format)
+    specs = (spec for spec in map(find_spec, names) if spec is not None)
+    origin, is_package = next(
+        ((spec.origin, bool(spec.submodule_search_locations)) for spec in specs if spec.origin), ("", False)
+    )
+    if not Path(origin).is_file():
+        raise FileNotFoundError(origin)
+    files = sorted(Path(origin).parent.rglob("*")) if is_package else [Path(origin)]
+    return [file for file in files if file.is_file() and file.suffix != ".pyc"]
 
 
 def episode_software(task: str, robot: str = "baxter") -> dict[str, str]:
@@ -81,8 +114,6 @@ def policy_software(policy_class: type) -> dict[str, str]:
 @cache
 def _package_digest(package: str) -> str:
     """Digest of a package's Python files: one that is installed in place changes without a new version."""
-    from importlib.util import find_spec
-
     spec = find_spec(package)
     places = list(spec.submodule_search_locations or []) if spec else []
     if not places:

@@ -7,10 +7,10 @@ import json
 import re
 import shutil
 import sys
+import zipfile
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,9 +22,8 @@ from hdril.evaluation.evaluate import Job, Worker, make_job
 from hdril.evaluation.identity import Identity, differences, identify_trials, require_same
 from hdril.evaluation.journal import Journal
 from hdril.evaluation.score import Outcome
-from hdril.evaluation.software import episode_software, evaluation_software
+from hdril.evaluation.software import _plugin_digest, episode_software, evaluation_software
 from hdril.evaluation.stored import read_evaluation
-from hdril.tasks import TASKS
 from tests.evaluation.checkpoints import listing, save_replay
 
 SEED = 500_000
@@ -122,12 +121,70 @@ def test_software_is_what_is_installed() -> None:
     assert re.fullmatch(rf"{robot} \([0-9a-f]{{12}}\)", software["robot model"])
 
 
-def test_a_task_of_another_package_counts_by_its_source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = tmp_path / "stacking.py"
-    file.write_text("TASK = None")
-    monkeypatch.setattr(type(TASKS), "source", lambda self, name: SimpleNamespace(__name__=name, __file__=str(file)))
-    expected = hashlib.sha256(b"TASK = None").hexdigest()[:12]
+def installed(site: Path, task: str, value: str, files: dict[str, str]) -> None:
+    """What an installer leaves of a distribution that declares a task."""
+    for name, content in files.items():
+        (site / name).parent.mkdir(parents=True, exist_ok=True)
+        (site / name).write_text(content)
+    info = site / f"{task}-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {task}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[hdril.tasks]\n{task} = {value}\n")
+
+
+@pytest.mark.parametrize(
+    ("value", "folder"),
+    [
+        ("stack_a.deep.task", "stack_a"),
+        ("stack_b.deep.task:PLUGIN", "stack_b"),  # an object, not a module: what it is made of is in the package, too
+        ("many_firms.stack_c.task", "many_firms/stack_c"),  # a namespace package: others have modules in it
+    ],
+)
+def test_a_task_of_another_package_counts_by_all_its_files(
+    value: str, folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = f"stacking_{folder[-1]}"
+    inner = value.partition(":")[0].replace(".", "/")
+    files = {f"{folder}/__init__.py": "", f"{folder}/sizes.py": "WIDTH = 1", f"{folder}/cup.obj": "v 0 0 0"}
+    files |= {f"{inner}.py": "TASK = None", str(Path(inner).parent / "__init__.py"): ""}
+    installed(tmp_path, task, value, files | {"many_firms/other/unrelated.py": ""})
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def source() -> str:
+        _plugin_digest.cache_clear()
+        return episode_software(task)[f"source of {task}"]
+
+    first, seen = source(), set[str]()
+    (tmp_path / "many_firms/other/unrelated.py").write_text("X = 1")
+    (tmp_path / folder / "__pycache__").mkdir()
+    (tmp_path / folder / "__pycache__/sizes.cpython-312.pyc").write_text("bytecode")
+    assert source() == first
+    for name in (f"{inner}.py", f"{folder}/sizes.py", f"{folder}/cup.obj"):
+        (tmp_path / name).write_text("another")
+        seen.add(source())
+    assert len(seen | {first}) == 4
+
+
+def test_a_task_in_a_single_module_counts_by_that(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    installed(tmp_path, "stacking", "stacking_alone", {"stacking_alone.py": "TASK = None", "another.py": ""})
+    monkeypatch.syspath_prepend(tmp_path)
+    content = hashlib.sha256(b"TASK = None").hexdigest()
+    expected = hashlib.sha256(f"{content} stacking_alone.py\n".encode()).hexdigest()[:12]
     assert episode_software("stacking")["source of stacking"] == expected
+
+
+def test_a_task_whose_files_cannot_be_read_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package in an archive can be imported, but has no files to tell it by."""
+    with zipfile.ZipFile(tmp_path / "packed.zip", "w") as archive:
+        archive.writestr("packed_tasks/__init__.py", "")
+        archive.writestr("packed_tasks/stack.py", "TASK = None")
+    monkeypatch.syspath_prepend(tmp_path / "packed.zip")
+    installed(tmp_path / "site", "packed", "packed_tasks.stack", {})
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    with pytest.raises(
+        ValueError, match=r"^the task 'packed' comes from packed_tasks\.stack, whose files cannot be read: "
+    ):
+        episode_software("packed")
 
 
 def test_digests_are_shown_short_and_missing_records_are_said() -> None:
