@@ -67,7 +67,7 @@ def test_expert_succeeds_on_many_seeds(env: BimanualEnv) -> None:
 
 @pytest.mark.parametrize("idle", SIDES)
 def test_one_arm_fails(env: BimanualEnv, idle: str) -> None:
-    for seed in range(920_000, 920_020):
+    for seed in range(920_000, 920_006):
         _, info = play(env, seed, idle=idle)
         assert not info["is_success"], f"seed {seed}: the {idle} hand is not needed"
 
