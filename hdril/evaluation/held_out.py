@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from hdril.demonstrations.provenance import read_provenance
-from hdril.digest import SHORT
+from hdril.demonstrations.provenance import RECIPE_PATH
+from hdril.digest import SHORT, digest_json
 from hdril.evaluation.checkpoint import TRAINING, Checkpoint, read_json
 from hdril.tasks import base_name
 
@@ -107,10 +107,24 @@ def _from_dataset(checkpoint: Checkpoint, training_data: Path | None) -> tuple[l
         roots = [root for root in _candidates(checkpoint) if not _mismatch(checkpoint, root)]
     if not roots:
         return [], "the training data are not at hand, or are not what the checkpoint was trained on"
-    provenance = read_provenance(roots[0])
-    if provenance is None:
+    return _seeds_of(roots[0])
+
+
+def _seeds_of(root: Path) -> tuple[list[TrainingSeeds], str]:
+    """What a data set tells of its seeds, whatever version of hdril recorded it; and why it tells nothing, if so.
+
+    Only these fields of ``meta/hdril.json`` are read: a recipe that this version cannot play is a recipe all the same.
+    """
+    path = root / RECIPE_PATH
+    if not path.is_file():
         return [], "the training data have no record of seeds"
-    return [TrainingSeeds(provenance.recipe.task, frozenset(provenance.seeds), provenance.recipe_digest)], ""
+    told = read_json(path)
+    seeds, recipe = told.get("seeds"), told.get("recipe")
+    if not isinstance(seeds, list) or not seeds or not all(type(seed) is int for seed in seeds):
+        return [], f"{RECIPE_PATH} of the training data has no list of seeds"
+    if not isinstance(recipe, dict) or not isinstance(recipe.get("task"), str):
+        return [], f"{RECIPE_PATH} of the training data does not name the task of its seeds"
+    return [TrainingSeeds(recipe["task"], frozenset(seeds), digest_json(recipe))], ""
 
 
 def _candidates(checkpoint: Checkpoint) -> Iterator[Path]:

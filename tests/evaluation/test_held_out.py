@@ -11,6 +11,7 @@ import pytest
 
 from hdril.cli.eval import EvalConfig, PolicySource, eval_command
 from hdril.demonstrations.provenance import read_provenance
+from hdril.digest import digest_json
 from hdril.evaluation.checkpoint import Checkpoint, find_checkpoint
 from hdril.evaluation.held_out import check_held_out
 from tests.evaluation.checkpoints import listing, save_act, save_hdril, save_replay
@@ -126,6 +127,50 @@ def test_other_policies_are_known_by_the_statistics_of_their_data(
     (tmp_path / "foreign/meta/hdril.json").unlink()
     foreign = check_held_out(checkpoint, "table_lift", [77], tmp_path / "foreign")
     assert (foreign.known, foreign.basis) == (None, "the training data have no record of seeds")
+
+
+def test_data_of_another_version_of_hdril_tell_their_seeds(dataset: Path, tmp_path: Path) -> None:
+    """A recipe that this version cannot play is no reason to forget which seeds a policy has seen."""
+    checkpoint = find_checkpoint(str(save_act(tmp_path / "policy", dataset, None)))
+    data = tmp_path / "data"
+    shutil.copytree(dataset / "meta", data / "meta")
+    record = data / "meta/hdril.json"
+    told = json.loads(record.read_text())
+    del told["dropped"]
+    told["recipe"] |= {"hdril_version": "9.0", "weather": "rain"}
+    told["recipe"]["physics"] = {"wind": 3.0}
+    record.write_text(json.dumps(told))
+    held_out = check_held_out(checkpoint, "table_lift", [77], data)
+    assert (held_out.known, held_out.basis) == (
+        True, f"compared with the seeds of the training data, recipe {digest_json(told['recipe'])[:12]}"
+    )  # fmt: skip
+    with pytest.raises(ValueError, match=r"1 of 1 seeds \(5 to 5\) were in the training data"):
+        check_held_out(checkpoint, "table_lift", [5], data)
+    with pytest.raises(ValueError, match="trained on the task table_lift, not on peg_in_hole"):
+        check_held_out(checkpoint, "peg_in_hole", [77], data)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"seeds": None}, "has no list of seeds"),
+        ({"seeds": []}, "has no list of seeds"),
+        ({"seeds": ["5"]}, "has no list of seeds"),
+        ({"recipe": None}, "does not name the task of its seeds"),
+        ({"recipe": {"task": 3}}, "does not name the task of its seeds"),
+    ],
+)
+def test_data_that_do_not_tell_their_seeds_claim_nothing(
+    dataset: Path, tmp_path: Path, change: dict, reason: str
+) -> None:
+    checkpoint = find_checkpoint(str(save_act(tmp_path / "policy", dataset, None)))
+    record = Path(shutil.copytree(dataset / "meta", tmp_path / "data/meta")) / "hdril.json"
+    record.write_text(json.dumps(json.loads(record.read_text()) | change))
+    held_out = check_held_out(checkpoint, "table_lift", [77], tmp_path / "data")
+    assert (held_out.known, held_out.basis) == (None, f"meta/hdril.json of the training data {reason}")
+    record.write_text("{")
+    with pytest.raises(ValueError, match=r"data/meta/hdril\.json is not valid JSON"):
+        check_held_out(checkpoint, "table_lift", [77], tmp_path / "data")
 
 
 def test_data_without_statistics_to_compare_are_not_taken_for_the_training_data(dataset: Path, tmp_path: Path) -> None:
