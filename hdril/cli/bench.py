@@ -6,23 +6,29 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 from unittest.mock import patch
 
 from hdril.cli.common import run
 from hdril.demonstrations.provenance import Recipe
 from hdril.demonstrations.record import record
+from hdril.env import BimanualEnv
 from hdril.errors import UserError
+from hdril.rollout import run_episode
+from hdril.simulation.sensor import Sensor
 from hdril.simulation.world import World
-from hdril.tasks import get_task
+from hdril.tasks import Task, base_name, get_task
+from hdril.tasks.expert import ScriptedExpert
 
 
 @dataclass
 class BenchConfig:
-    """Measure recording against the bare simulator, the loader against a training step, one action, Rerun
-    recordings against the evaluation, training against LeRobot's ACT, and HDR-IL's models called as one or one by one."""
+    """Measure recording against the bare simulator, what scenes that vary cost, the loader against a training step, one
+    action, Rerun recordings against the evaluation, training against LeRobot's ACT, and HDR-IL's models called as one or one
+    by one."""
 
     task: str = "table_lift"
     """Name of the task, with its parameters if it has any (peg_in_hole:clearance=0.004); an unknown one is answered with
@@ -68,6 +74,34 @@ def bench_recording(task: str, episodes: int, root: Path) -> Figure:
     with patch.object(World, "step", timed_step):
         whole = _seconds(lambda: record(Recipe(task), episodes, 0, root))
     return Figure("recording, share of the bare simulator's rate", 100.0 * bare / whole, 70.0, True, "%")
+
+
+def bench_scenes(task: str, episodes: int) -> Figure:
+    """Share of the expert's episodes at the level ``hard`` that sampling, the sensor and the events take; one core."""
+    parts = [
+        (Task, "sample"), (Task, "at"), (Sensor, "__init__"), (Sensor, "observe"), (World, "_disturb"),
+        (BimanualEnv, "_begin_events"), (BimanualEnv, "_posture_offsets"),
+    ]  # fmt: skip
+    env = BimanualEnv(f"{base_name(task)}:level=hard")
+    expert, seconds = ScriptedExpert(env.task_spec), 0.0
+
+    def timed(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            nonlocal seconds
+            start = time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                seconds += time.perf_counter() - start
+
+        return call
+
+    with ExitStack() as stack, closing(env):
+        run_episode(env, expert, 0)
+        for owner, name in parts:
+            stack.enter_context(patch.object(owner, name, timed(getattr(owner, name))))
+        whole = _seconds(lambda: [run_episode(env, expert, seed) for seed in range(1, episodes)])
+    return Figure("scenes that vary and events, share of an episode", 100.0 * seconds / whole, 2.0, False, "%")
 
 
 def bench_training(task: str, root: Path, steps: int, output: Path) -> Figure:
@@ -182,11 +216,9 @@ def bench_policies(root: Path) -> list[Figure]:
 def bench_rerun(task: str, folder: Path) -> Figure:
     """Share of an evaluation, the expert's episode included, that its Rerun recording takes; one core. The policy's own time
     is left out: the share with one is less."""
-    from hdril.env import BimanualEnv
     from hdril.evaluation.evaluate import EvaluatedEpisode
     from hdril.evaluation.reference import Reference
     from hdril.evaluation.score import score_episode
-    from hdril.tasks.expert import ScriptedExpert
     from hdril.tasks.primitives import Noise
     from hdril.trace import trace_episode
     from hdril.viewer.recordings import write_recording
@@ -196,7 +228,7 @@ def bench_rerun(task: str, folder: Path) -> Figure:
     for seed in range(5):
         start = time.perf_counter()
         (trace, ending), (again, _) = (trace_episode(env, expert, seed) for _ in range(2))
-        reference = Reference.of(again, ending)
+        reference = Reference.of(env.task_spec, again, ending)
         outcome = score_episode(env.task_spec, seed, trace, reference, ending)
         middle = time.perf_counter()
         write_recording(folder, EvaluatedEpisode(env, outcome, trace, reference))
@@ -213,6 +245,7 @@ def bench_command(config: BenchConfig) -> None:
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "dataset"
         print(bench_recording(config.task, config.episodes, root), flush=True)
+        print(bench_scenes(config.task, config.episodes), flush=True)
         print(bench_training(config.task, root, config.train_steps, Path(folder) / "train"), flush=True)
         print(bench_action(root, config.task), flush=True)
         print(bench_rerun(config.task, Path(folder) / "rerun"), flush=True)
