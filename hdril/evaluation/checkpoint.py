@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from hdril.digest import digest_file, digest_files, digest_json
 from hdril.evaluation.identity import PolicyIdentity
+from hdril.evaluation.overrides import ELSEWHERE, running_options
 from hdril.evaluation.software import policy_software
 
 if TYPE_CHECKING:
@@ -19,12 +20,6 @@ if TYPE_CHECKING:
 
 CONFIG, WEIGHTS, TRAINING = "config.json", "model.safetensors", "train_config.json"
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
-_ELSEWHERE = frozenset(
-    {"push_to_hub", "repo_id", "private", "tags", "license", "pretrained_path", "pretrained_revision"}
-)
-"""Options of LeRobot's configs that say where a policy goes or came from. They change no action."""
-_OF_TRAINING = ("optimizer_", "scheduler_")
-"""What the names of LeRobot's options begin with that training alone reads."""
 
 
 @dataclass(frozen=True)
@@ -165,10 +160,10 @@ def resolve_config(checkpoint: Checkpoint, overrides: Iterable[str] = (), device
     kind = checkpoint.read_config().get("type")
     if kind not in known:
         raise ValueError(
-            f"{checkpoint.folder / CONFIG} is of a policy of the type {kind!r}; installed: {', '.join(known)}"
+            f"{checkpoint.folder / CONFIG} is of a policy of the type {kind!r}; installed: {', '.join(sorted(known))}"
         )
     given = list(overrides)
-    _check_options(kind, given, {entry.name for entry in fields(known[kind])})
+    _check_options(kind, known[kind], given)
     complaint = io.StringIO()  # argparse prints all options before it says what is wrong
     try:
         with redirect_stderr(complaint):
@@ -185,8 +180,9 @@ def resolve_config(checkpoint: Checkpoint, overrides: Iterable[str] = (), device
     return config
 
 
-def _check_options(kind: str, overrides: list[str], known: set[str]) -> None:
-    usable = sorted(name for name in known - _ELSEWHERE if not name.startswith(_OF_TRAINING))
+def _check_options(kind: str, config_class: type[PreTrainedConfig], overrides: list[str]) -> None:
+    known = {entry.name for entry in fields(config_class)}
+    usable = running_options(config_class)
     for override in overrides:
         name, equals, _ = override.removeprefix("--").partition("=")
         option = name.partition(".")[0]
@@ -204,7 +200,7 @@ def identify(checkpoint: Checkpoint, config: PreTrainedConfig) -> PolicyIdentity
     from lerobot.policies.factory import get_policy_class
 
     values = draccus.encode(config)
-    for name in (*_ELSEWHERE, "device"):
+    for name in (*ELSEWHERE, "device"):
         values.pop(name, None)
     return PolicyIdentity(
         type=config.type,

@@ -74,7 +74,10 @@ def test_an_action_that_is_not_finite_is_named(checkpoint: Path, tmp_path: Path)
     [
         (["--policy.bogus=7"], "hdril has no option policy.bogus; it has: "),
         (["--policy.rollout=backwards"], "argument policy.rollout: invalid choice: 'backwards'"),
-        (["--policy.hidden_dim=64"], "policy.hidden_dim is 128 in the checkpoint"),
+        (
+            ["--policy.hidden_dim=64"],
+            "policy.hidden_dim cannot change an evaluation; what can: experts, replan_every, rollout, samples",
+        ),
         (["--policy.repo_id=a/b"], "policy.repo_id cannot change an evaluation; what can: "),
         (["--max_frames=69"], "max_frames must be at least 70, the horizon of table_lift"),
         (["--seed=5"], "1 of 1 seeds (5 to 5) were in the training data"),

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
 from huggingface_hub.errors import LocalEntryNotFoundError
-from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot_policy_hdril import HDRILConfig
 from safetensors.torch import load_file, save_file
 
 from hdril.cli.eval import EvalConfig, PolicySource, eval_command, split_overrides
 from hdril.evaluation.checkpoint import find_checkpoint, resolve_config
 from hdril.evaluation.lerobot_actor import LeRobotActor
+from hdril.evaluation.overrides import running_options
 from hdril.tasks import get_task
-from tests.evaluation.checkpoints import listing, save_act, save_replay
+from tests.evaluation.checkpoints import listing, save_act, save_hdril, save_replay
 
 
 @pytest.fixture
@@ -25,6 +29,11 @@ def replay(tmp_path: Path) -> Path:
 @pytest.fixture(scope="module")
 def act(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return save_act(tmp_path_factory.mktemp("act") / "policy", dataset, None)
+
+
+@pytest.fixture(scope="module")
+def hdril(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_hdril(tmp_path_factory.mktemp("hdril") / "policy", dataset)
 
 
 def truncate(path: Path) -> None:
@@ -87,14 +96,49 @@ def test_overrides_that_cannot_act_are_refused(replay: Path, tmp_path: Path, ove
     assert listing(tmp_path) == before
 
 
-def test_options_of_training_cannot_change_an_evaluation(act: Path) -> None:
-    with pytest.raises(
-        ValueError, match=r"policy\.optimizer_lr cannot change an evaluation; what can: .*temporal_ensemble"
-    ):
-        resolve_config(find_checkpoint(str(act)), ("--optimizer_lr=1",))
+@pytest.mark.parametrize(
+    "override",
+    [
+        "--optimizer_lr=1", "--dropout=0.5", "--kl_weight=2", "--use_amp=true", "--use_peft=true", "--input_features={}",
+        "--pretrained_backbone_weights=null", "--normalization_mapping={}", "--device=cpu",
+    ],
+)  # fmt: skip
+def test_options_without_effect_are_refused(act: Path, override: str) -> None:
+    name = override[2:].partition("=")[0]
+    message = (
+        rf"^policy\.{name} cannot change an evaluation; what can: chunk_size, .*n_action_steps, .*temporal_ensemble"
+    )
+    with pytest.raises(ValueError, match=message) as caught:
+        resolve_config(find_checkpoint(str(act)), (override,))
+    assert f" {name}," not in str(caught.value)
+
+
+def test_options_with_effect_are_taken(act: Path) -> None:
     config = resolve_config(find_checkpoint(str(act)), ("--n_action_steps=3",))
-    assert isinstance(config, ACTConfig)
-    assert config.n_action_steps == 3
+    assert vars(config)["n_action_steps"] == 3
+
+
+@pytest.mark.parametrize("name", sorted({entry.name for entry in fields(HDRILConfig)}))
+def test_each_option_of_hdril_acts_or_is_refused(name: str, hdril: Path) -> None:
+    """The policy says which of its options act; that they do is tested with the policy."""
+    found = find_checkpoint(str(hdril))
+    acting = {"experts": "stacked", "replan_every": "0", "rollout": "open_loop", "samples": "0"}
+    if name in acting:
+        assert str(vars(resolve_config(found, (f"--{name}={acting[name]}",)))[name]) == acting[name]
+        return
+    message = rf"^policy\.{name} cannot change an evaluation; what can: experts, replan_every, rollout, samples$"
+    with pytest.raises(ValueError, match=message):
+        resolve_config(found, (f"--{name}=1",))
+
+
+def test_options_that_a_policy_declares_anew_are_its_own() -> None:
+    """LeRobot's base class has ``n_obs_steps`` and ``use_amp``; diffusion reads the one, ACT reads neither but checks it."""
+    register_third_party_plugins()
+    known = PreTrainedConfig.get_known_choices()
+    assert "n_obs_steps" in running_options(known["diffusion"])
+    assert "use_amp" not in running_options(known["diffusion"])
+    assert "use_amp" in running_options(known["evo1"])
+    assert running_options(known["replay"]) == ["frames", "labels", "primitives", "scale"]
 
 
 @pytest.mark.parametrize(

@@ -120,6 +120,9 @@ class HDRILConfig(PreTrainedConfig):
         }
     )
 
+    running_options = frozenset({"samples", "rollout", "replan_every", "experts"})
+    """What of a trained policy may change when it is run; everything else acts in training, or its weights have fixed it."""
+
     _given = frozenset[str]()
     """Names of the values that the constructor was given."""
 

@@ -8,8 +8,6 @@ from lerobot.configs.policies import PreTrainedConfig
 
 from lerobot_policy_hdril.configuration_hdril import HDRILConfig
 
-# How the policy is run.
-_RUNNING = {"samples", "rollout", "replan_every", "experts"}
 # What further training reads. The fit of a checkpoint is not made anew for other settings: ridge and min_std are fixed.
 _TRAINING = {
     "kl_weight",
@@ -24,7 +22,7 @@ _TRAINING = {
 }
 # LeRobot's own: device, repository, features (which it fills in by itself) and the like.
 _LEROBOT = {entry.name for entry in fields(PreTrainedConfig)}
-CHANGEABLE = frozenset(_RUNNING | _TRAINING | _LEROBOT)
+CHANGEABLE = frozenset(HDRILConfig.running_options | _TRAINING | _LEROBOT)
 """Fields of :class:`HDRILConfig` that an override of a checkpoint may change. ``replan_every`` has limits of its own."""
 
 
