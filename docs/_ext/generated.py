@@ -12,6 +12,11 @@ from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
+from hdril.markdown import table
+from hdril.tasks import TASKS
+from hdril.tasks.events import EVENT_KINDS, EventSpec
+from hdril.tasks.factors import COMMON
+
 
 def help_of(module: str) -> str:
     """What ``--help`` of a command prints.
@@ -49,6 +54,36 @@ class ModuleText(SphinxDirective):
         return self.parse_text_to_nodes(module.__doc__ or "")
 
 
+class TaskVariation(SphinxDirective):
+    """``{task-variation} table_lift``: what varies in a task, and what may happen to it, as tables.
+
+    ``{task-variation} all``: the factors that every task has.
+    """
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        name = self.arguments[0]
+        factors = COMMON if name == "all" else TASKS[name].factors
+        rows = [
+            [f"`{f.name}`", f.kind, f"{f.span:g} {f.unit}", f"{f.limit:g} {f.unit}", f.meaning, ", ".join(f.parts)]
+            for f in factors
+        ]
+        text = table(["factor", "kind", "range", "at most", "what varies", "each for"], rows)
+        if name != "all":
+            text += "\n\n" + table(
+                ["event", "kind", "begins at frame", "takes", "happens to", "strength"], map(_event, TASKS[name].events)
+            )
+        return self.parse_text_to_nodes(text)
+
+
+def _event(spec: EventSpec) -> list[str]:
+    unit = EVENT_KINDS[spec.kind].unit
+    strength = f"{spec.strength[0]:g} to {spec.strength[1]:g} {unit}" if spec.strength else ""
+    frames = "" if spec.frames == (1, 1) else "{} to {} frames".format(*spec.frames)
+    return [f"`{spec.name}`", spec.kind, "{} to {}".format(*spec.window), frames, ", ".join(spec.targets), strength]
+
+
 def escape_bars(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
     """Norms in equations, |x|, are no substitutions of reStructuredText: escape bars that are not in literals."""
     for number, line in enumerate(lines):
@@ -61,6 +96,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     """Called by Sphinx."""
     app.add_directive("command-help", CommandHelp)
     app.add_directive("module-text", ModuleText)
+    app.add_directive("task-variation", TaskVariation)
     # After napoleon, which makes fields of sections.
     app.connect("autodoc-process-docstring", escape_bars, priority=900)
     return {"parallel_read_safe": True}
