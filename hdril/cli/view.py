@@ -70,10 +70,14 @@ def recordings(config: ViewConfig) -> list[Path]:
         print(f"Episode {config.episode}: {line}")
         return [path]
     assert config.run is not None
-    evaluation = read_evaluation(config.run)
-    if config.against is not None and config.seed is not None:
+    evaluation, against = read_evaluation(config.run), config.against and read_evaluation(config.against)
+    if config.seed is not None:
+        for played in (evaluation, against):
+            if played is not None:
+                played.require_seed(config.seed)
+    if against is not None and config.seed is not None:
         made = config.save or MADE / f"compare_seed_{config.seed:07d}.rrd"
-        return [compare(evaluation, read_evaluation(config.against), config.seed, made)]
+        return [compare(evaluation, against, config.seed, made)]
     found = find_recordings(config.run, config.seed)
     if not found and config.seed is None:
         results = evaluation.results

@@ -36,6 +36,12 @@ class StoredEvaluation:
         remedy = "compare evaluations of the same task and seeds, by the same software"
         require_same(str(self.folder), self.identity.get("trials"), asdict(trials), remedy)
 
+    def require_seed(self, seed: int) -> None:
+        """Raises ValueError unless ``seed`` is one of those of the evaluation."""
+        first, last = self.results["first_seed"], self.results["first_seed"] + self.results["n_episodes"] - 1
+        if not first <= seed <= last:
+            raise ValueError(f"seed must be one of those of {self.folder}, {first} to {last}, got {seed}")
+
     def require_comparison(self, other: StoredEvaluation) -> None:
         """Raises ValueError unless these results are compared with those of ``other``; names what differs."""
         comparison = self.results.get("comparison")

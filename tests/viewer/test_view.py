@@ -117,6 +117,24 @@ def test_two_policies_side_by_side(runs: dict[str, Path], tmp_path: Path) -> Non
     assert "in lift" in text.split("entity_path: /damaged/log")[1].split("entity_path:")[0]
 
 
+@pytest.mark.parametrize("seed", [SEED - 1, SEED + 1])
+def test_a_seed_that_was_not_evaluated_is_refused(runs: dict[str, Path], tmp_path: Path, seed: int, capsys) -> None:
+    """Its episode belongs to no result, and it may be a seed of the training data."""
+    message = rf"^seed must be one of those of {runs['whole']}, {SEED} to {SEED}, got {seed}$"
+    with pytest.raises(ValueError, match=message):
+        view_command(ViewConfig(run=runs["whole"], seed=seed, save=tmp_path / "one.rrd"))
+    results = json.loads((runs["whole"] / "results.json").read_text()) | {
+        "first_seed": min(seed, SEED),
+        "n_episodes": 2,
+    }
+    (tmp_path / "wider").mkdir()
+    (tmp_path / "wider/results.json").write_text(json.dumps(results))
+    with pytest.raises(ValueError, match=message):
+        view_command(ViewConfig(run=tmp_path / "wider", against=runs["whole"], seed=seed, save=tmp_path / "both.rrd"))
+    assert capsys.readouterr().out == ""
+    assert [path.name for path in tmp_path.iterdir()] == ["wider"]
+
+
 def test_recordings_of_a_run_are_saved_as_one_file(runs: dict[str, Path], tmp_path: Path) -> None:
     view_command(ViewConfig(run=runs["damaged"], save=tmp_path / "all.rrd"))
     (recording,) = (runs["damaged"] / "rerun").iterdir()
