@@ -101,7 +101,7 @@ class ScriptedExpert:
             raise StopIteration(f"nothing can be done for {wanted}")
         self._next = again[-1] + 1
         self._queue = [script[again[-1]]]
-        if not again[-1] and self.task.recovery:
+        if not self._queue[0].needs and self.task.recovery:
             self._queue = [*self.task.recovery, *self._queue]
         return self._queue.pop(0), (f"back to {script[self._next - 1].name}: {wanted} is not possible",)
 

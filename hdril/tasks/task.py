@@ -115,6 +115,10 @@ class Task:
     """Numbers of bodies that may differ, such as ``("table.width", 0.85)``, m; the name begins with that of the body."""
     admissible: Callable[[dict[str, Pose], Values], bool] = lambda poses, values: True
     """Whether a scene that was drawn can be; another is drawn where it cannot."""
+    arrange: Callable[[dict[str, Pose]], dict[str, Pose]] = lambda poses: poses
+    """What follows from the places that were drawn, such as a rack that stands on the side where the bar does not lie."""
+    length: int | None = None
+    """Frames of the shortest plan; the sum of the primitives unless given. Some plans skip primitives."""
     variation: Variation = NOMINAL
     detailed: bool = False
     """Whether ``also_observed`` and ``attributes`` are observed."""
@@ -134,8 +138,8 @@ class Task:
 
     @property
     def horizon(self) -> int:
-        """Frames of one demonstration."""
-        return sum(primitive.frames for primitive in self.primitives)
+        """Frames of one demonstration in which nothing goes wrong."""
+        return sum(primitive.frames for primitive in self.primitives) if self.length is None else self.length
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -178,7 +182,7 @@ class Task:
             }
             scene = self.at(values)
             rng = np_random(seed)[0] if attempt == 0 else stream(seed, "placements", attempt)
-            poses = {body.name: scene.placements[body.name].sample(rng) for body in scene.bodies}
+            poses = scene.arrange({body.name: scene.placements[body.name].sample(rng) for body in scene.bodies})
             if not values or self.admissible(poses, values):
                 vectors = {body: tuple(pose.as_vector().tolist()) for body, pose in poses.items()}
                 return Scenario(self.name, seed, values, vectors, self._sample_events(seed))
