@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Observation = dict[str, NDArray[np.float32]]
-"""``agent_pos`` (16,) and ``environment_state`` (7 per observed object), see :class:`hdril.env.BimanualEnv`."""
+"""``agent_pos`` (16,) and ``environment_state`` (7 per object, then attributes), see :class:`hdril.env.BimanualEnv`."""
 
 
 @dataclass(frozen=True)

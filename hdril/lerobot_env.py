@@ -29,7 +29,7 @@ class HDRILEnvConfig(EnvConfig):
     robot: str = "baxter"
     fps: int = BimanualEnv.metadata["render_fps"]
     episode_length: int | None = None
-    """Frames after which an episode is cut; the task's horizon unless given, and no fewer."""
+    """Frames after which an episode is cut; the task's budget unless given, and no fewer than its horizon."""
     meshes: bool = False
     """Draw the robot's meshes in videos instead of simple shapes, which is ten times as slow."""
     rerun: str = "none"
@@ -50,7 +50,7 @@ class HDRILEnvConfig(EnvConfig):
         self.features = {
             ACTION: PolicyFeature(FeatureType.ACTION, (len(ACTION_NAMES),)),
             "agent_pos": PolicyFeature(FeatureType.STATE, (len(ACTION_NAMES),)),
-            "environment_state": PolicyFeature(FeatureType.ENV, (7 * len(spec.observed),)),
+            "environment_state": PolicyFeature(FeatureType.ENV, (len(spec.state_names),)),
         }
 
     @property

@@ -53,6 +53,8 @@ def transitions(
 ) -> Iterator[Transition]:
     """Play the scene of ``seed`` frame by frame, until the environment terminates or truncates the episode.
 
+    An actor that raises StopIteration knows nothing more to do: the episode ends there, as a failure.
+
     ``scenario`` is played instead of the one that the environment samples from the seed, such as its control without events.
     """
     observation, info = env.reset(seed=seed, options=None if scenario is None else {"scenario": scenario})
@@ -61,7 +63,10 @@ def transitions(
         observer.begin(env, observation, info)
     over = False
     while not over:
-        decision = actor.act(env.exact_observation() if isinstance(actor, Privileged) else observation)
+        try:
+            decision = actor.act(env.exact_observation() if isinstance(actor, Privileged) else observation)
+        except StopIteration:
+            return
         # float32 is what a dataset stores: an episode can be played again from its recorded actions.
         action = np.asarray(decision.action, np.float32)
         sent = action if decision.sent is None else np.asarray(decision.sent, np.float32)

@@ -56,8 +56,8 @@ class EvalConfig:
     seed: int = 100_000
     """First seed. Seeds that the policy was trained on are refused."""
     max_frames: int | None = None
-    """Frames after which an episode is cut; at least the task's horizon, which is the default. With more, a policy that
-    failed may try again."""
+    """Frames after which an episode is cut; at least the task's horizon. By default that is its budget: the horizon, or three
+    times that where something may happen to the episode. With more, a policy that failed may try again."""
     training_data: Path | None = None
     """Folder of the dataset that the policy was trained on, if it is not found: to check that the seeds are held out. It
     must have the statistics that the checkpoint keeps. Checkpoints of hdril know their training data."""
@@ -123,7 +123,7 @@ def describe(job: Job, held_out: HeldOut) -> Run:
         num_episodes=trials.num_episodes,
         held_out=held_out.known,
         held_out_basis=held_out.basis,
-        max_frames=0 if trials.max_frames == task.horizon else trials.max_frames,
+        max_frames=0 if trials.max_frames == task.budget else trials.max_frames,
         notes=(note,) if foreign else (),
         identity=job.identity.as_dict(),
         policy_folder=str(job.checkpoint.folder),

@@ -67,7 +67,7 @@ def make_job(
         first_seed: of ``num_episodes`` seeds in a row.
         overrides: changes of the policy's config, as ``--name=value``.
         device: of the policy.
-        max_frames: frames after which an episode is cut; the task's horizon unless given.
+        max_frames: frames after which an episode is cut; the task's budget unless given.
 
     Raises:
         FileNotFoundError: there is no such checkpoint.

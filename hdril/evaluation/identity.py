@@ -65,13 +65,13 @@ class Identity:
 
 
 def identify_trials(task: str, first_seed: int, num_episodes: int, max_frames: int | None = None) -> TrialsIdentity:
-    """The trials on a task's seeds from ``first_seed`` on; ``max_frames`` is the task's horizon unless given.
+    """The trials on a task's seeds from ``first_seed`` on; ``max_frames`` is the task's budget unless given.
 
     Raises:
         ValueError: there is no such task, or an episode would be cut before the task's horizon, where success is judged.
     """
-    horizon = get_task(task).horizon
-    frames = horizon if max_frames is None else max_frames
+    horizon, budget = get_task(task).horizon, get_task(task).budget
+    frames = budget if max_frames is None else max_frames
     if frames < horizon:
         raise ValueError(
             f"max_frames must be at least {horizon}, the horizon of {task}, from which on success is judged; got {frames}"

@@ -102,4 +102,5 @@ def _read_outcomes(path: Path) -> Iterator[Outcome]:
             return  # the process ended while it wrote the last line: that seed is played again
         for name in ("start", "primitives"):
             values[name] = tuple(values[name])
+        values["events"] = tuple((frame, event) for frame, event in values["events"])
         yield Outcome(**values)

@@ -13,7 +13,7 @@ key                                   meaning
 ``first_seed``, ``num_episodes``      the seeds are ``first_seed``, ``first_seed + 1``, …; one episode each
 ``held_out``                          whether the seeds were checked to be apart from the training data; null: cannot be told
 ``held_out_basis``                    what it was checked against, or why it cannot be told
-``max_frames``                        frames after which an episode was cut; 0: the task's horizon
+``max_frames``                        frames after which an episode was cut; 0: the task's budget
 ``notes``                             sentences that a reader of the results must know
 ``identity``                          what made the results, see :class:`hdril.evaluation.identity.Identity`
 ``n_episodes``, ``n_success``         episodes played, and those that succeeded
@@ -82,7 +82,7 @@ class Run:
     held_out_basis: str = ""
     """What it was checked against, or why it cannot be told: a phrase for reports and cards."""
     max_frames: int = 0
-    """Frames after which an episode was cut; 0: the task's horizon."""
+    """Frames after which an episode was cut; 0: the task's budget (:attr:`hdril.tasks.Task.budget`)."""
     notes: tuple[str, ...] = ()
     """Sentences that a reader of the results must know."""
     identity: dict[str, Any] = field(default_factory=dict)

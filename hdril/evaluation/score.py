@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdril.evaluation.metrics import trajectory_error
-from hdril.evaluation.reference import Reference
+from hdril.evaluation.motion import Motion, motion
+from hdril.evaluation.reference import Reference, observed_poses
 from hdril.rollout import Ending
 from hdril.simulation.actions import hand_poses
 from hdril.tasks import Task
@@ -58,13 +59,22 @@ class Outcome:
     """The primitive that was played then (the expert's, if the policy has none)."""
     expert_success: bool = True
     """Whether the expert solves the scene of this seed. If not, the errors above say nothing about the policy."""
+    motion: dict[str, float] = field(default_factory=dict)
+    """How the hands moved (:class:`hdril.evaluation.motion.Motion`), in the units that the names end with."""
+    stages: int = 0
+    """How many of the task's stages were reached; success counts as one more."""
+    events: tuple[tuple[int, str], ...] = ()
+    """What happened to the episode: frames, and events in words."""
+    scenario: str = ""
+    """The scene and what happened to it, as JSON (:class:`hdril.tasks.scenario.Scenario`)."""
 
 
 def score_episode(task: Task, seed: int, trace: Trace, reference: Reference, ending: Ending) -> Outcome:
     """Compare an episode with the expert's on the same seed."""
     error = trajectory_error(trace.state, reference.state)
     confusion, hits = _planner_scores(trace, len(task.labels))
-    departed = _departure(trace, reference)
+    departed = _departure(task, trace, reference)
+    moved: Motion = motion(trace, task.observed, task.physics.control_period)
     return Outcome(
         seed=seed,
         success=ending.success,
@@ -75,7 +85,7 @@ def score_episode(task: Task, seed: int, trace: Trace, reference: Reference, end
         angle_error_rad=float(error.angle.mean()),
         dtw_cm=100.0 * error.dtw,
         position_error_cm_by_primitive=_error_by_primitive(error.position, reference.scripted, task.labels),
-        start=_start(trace),
+        start=_start(task, trace),
         primitives=_played(trace.executed, task.labels),
         stage=("", *(stage.name for stage in task.stages), "success")[trace.stage[-1]],
         planner_confusion=confusion,
@@ -84,6 +94,10 @@ def score_episode(task: Task, seed: int, trace: Trace, reference: Reference, end
         departed_in=_primitive_at(trace, departed, task.labels),
         measures={m.name: round(float(v), 5) for m, v in zip(task.measures, trace.measures[-1], strict=True)},
         expert_success=reference.success,
+        motion={name: round(float(value), 5) for name, value in vars(moved).items()},
+        stages=int(trace.stage[-1]),
+        events=tuple((frame, event) for frame, event in enumerate(trace.events) if event),
+        scenario=trace.scenario.to_json(),
     )
 
 
@@ -100,10 +114,9 @@ def _error_by_primitive(
     }
 
 
-def _start(trace: Trace) -> tuple[float, ...]:
+def _start(task: Task, trace: Trace) -> tuple[float, ...]:
     """x and y of every observed object before the first frame, m, to a tenth of a millimetre."""
-    positions = trace.environment_state[0].reshape(-1, 7)[:, :2]
-    return tuple(round(float(value), 4) for value in positions.ravel())
+    return tuple(round(float(value), 4) for name in task.observed for value in trace.poses[name][0, :2])
 
 
 def _played(executed: NDArray[np.int64], labels: tuple[str, ...]) -> tuple[str, ...]:
@@ -120,18 +133,18 @@ def _primitive_at(trace: Trace, frame: int, labels: tuple[str, ...]) -> str:
     return labels[label] if label >= 0 else ""
 
 
-def _departure(trace: Trace, reference: Reference) -> int:
+def _departure(task: Task, trace: Trace, reference: Reference) -> int:
     """The frame whose end is the first with a hand or an object too far from the expert's; -1 if there is none."""
-    ours, theirs = _positions(trace), _positions(reference)
+    ours = _positions(trace.state, observed_poses(task, trace))
+    theirs = _positions(reference.state, reference.objects)
     frames = min(len(ours), len(theirs))
     away = np.linalg.norm(ours[:frames] - theirs[:frames], axis=-1).max(1) > DEPARTURE
     return max(int(away.argmax()) - 1, 0) if away.any() else -1
 
 
-def _positions(episode: Trace | Reference) -> NDArray[np.float64]:
+def _positions(state: NDArray[np.float32], objects: NDArray[np.float64]) -> NDArray[np.float64]:
     """Positions (T + 1, hands and objects, 3), m."""
-    objects = episode.environment_state.reshape(len(episode.state), -1, 7).astype(np.float64)
-    return np.concatenate([hand_poses(episode.state), objects], axis=1)[..., :3]
+    return np.concatenate([hand_poses(state), objects], axis=1)[..., :3]
 
 
 def _planner_scores(trace: Trace, count: int) -> tuple[list[list[int]], list[bool]]:

@@ -45,8 +45,7 @@ class EpisodeLog:
         trace, times = self._trace, self._times
         self._scene()
         self._robot()
-        objects = trace.environment_state.reshape(len(times), -1, 7).swapaxes(0, 1)
-        for name, poses in zip(self._env.task_spec.observed, objects, strict=True):
+        for name, poses in self._moving().items():
             columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, 3:])
             self._stream.send_columns(f"{self._root}world/{name}", _columns(times), columns)
         expert = self._reference.state
@@ -59,6 +58,11 @@ class EpisodeLog:
         self._explanations()
         self._scalars()
         self._verdict()
+
+    def _moving(self) -> dict[str, NDArray[np.float64]]:
+        """Poses (T + 1, 7) of the bodies that are observed or that move, as they were: observations may be late and noisy."""
+        objects, poses = self._env.task_spec.objects, self._trace.poses
+        return {name: rows for name, rows in poses.items() if name in objects or (rows != rows[0]).any()}
 
     def _log(self, entity: str, component, static: bool = False) -> None:
         self._stream.log(self._root + entity, component, static=static)
@@ -82,9 +86,9 @@ class EpisodeLog:
                 fill_mode="solid",
             )
             self._log(f"world/{body.name}/shape", shape, static=True)
-            if body.name not in self._env.task_spec.observed:
-                pose = self._env.world.pose(body.name)
-                place = rr.Transform3D(translation=pose.position, quaternion=pose.quaternion.tolist())
+            if body.name not in self._moving():
+                pose = self._trace.poses[body.name][0]
+                place = rr.Transform3D(translation=pose[:3], quaternion=pose[3:])
                 self._log(f"world/{body.name}", place, static=True)
 
     def _robot(self) -> None:
@@ -164,6 +168,8 @@ class EpisodeLog:
     def _verdict(self) -> None:
         """Events on the timeline, and the outcome in words."""
         outcome, times = self._outcome, self._times
+        for frame, event in outcome.events:
+            self._log_at(frame, "log", rr.TextLog(event, level="WARN"))
         for frame, failure in enumerate(self._trace.ik_failures):
             if failure:
                 self._log_at(frame, "log", rr.TextLog(f"no inverse kinematics: {failure}", level="WARN"))
@@ -173,13 +179,14 @@ class EpisodeLog:
             where = f"more than 2 cm from the expert's path, in {outcome.departed_in}"
             self._log_at(frame, "log", rr.TextLog(where, level="WARN"))
             left = f"**At {times[frame]:.1f} s first {where}.**\n\n"
+        happened = "".join(f"**{event} at {times[frame]:.1f} s.**\n\n" for frame, event in outcome.events)
         verdict = "success" if outcome.success else f"failure: {outcome.unmet}"
         level = "INFO" if outcome.success else "ERROR"
         self._log_at(len(times) - 1, "log", rr.TextLog(verdict, level=level))
         self._stream.reset_time()
         text = (
             f"**{self._env.task}, seed {outcome.seed}: {verdict}**\n\n{left}"
-            f"Played: {' → '.join(outcome.primitives) or 'no primitives'}\n\n"
+            f"{happened}Played: {' → '.join(outcome.primitives) or 'no primitives'}\n\n"
             f"Mean error against the expert: {outcome.position_error_cm:.2f} cm, {outcome.angle_error_rad:.3f} rad. "
             f"Inverse kinematics failed on {outcome.ik_failures} of {outcome.frames} frames."
         )

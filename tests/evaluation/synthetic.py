@@ -41,7 +41,7 @@ def trace(
         rows[..., 6] = 1.0
     return Trace(
         state=state.reshape(frames + 1, 16),
-        environment_state=things.reshape(frames + 1, 7 * objects),
+        environment_state=things.reshape(frames + 1, 7 * objects).copy(),
         action=state[:-1].reshape(frames, 16),
         joints=np.zeros((frames + 1, 18)),
         reward=np.zeros(frames, np.float32),
@@ -53,20 +53,29 @@ def trace(
         ik_error=np.zeros((frames, 2)),
         grip_force=np.zeros((frames + 1, 2)),
         contacts={},
+        poses={name: things[:, i].astype(np.float64) for i, name in enumerate(task.observed)},
+        held={name: np.zeros((frames + 1, 2), np.bool_) for name in task.observed},
+        peak_force=np.zeros(frames + 1),
+        events=("",) * frames,
+        scenario=task.sample(0),
     )
 
 
 def moved(episode: Trace, first_row: int, offset: Sequence[float], hand: int | None = None) -> Trace:
     """A trace whose hand (0, 1), or whose object if ``hand`` is None, is ``offset`` (3,), m, away from ``first_row`` on."""
-    name, start = ("environment_state", 0) if hand is None else ("state", 8 * hand)
-    rows = getattr(episode, name).copy()
-    rows[first_row:, start : start + 3] += np.asarray(offset, np.float32)
-    return replace(episode, **{name: rows})
+    if hand is None:
+        (name,) = episode.poses
+        poses = episode.poses[name].copy()
+        poses[first_row:, :3] += offset
+        return replace(episode, poses={name: poses})
+    state = episode.state.copy()
+    state[first_row:, 8 * hand : 8 * hand + 3] += np.asarray(offset, np.float32)
+    return replace(episode, state=state)
 
 
-def reference(episode: Trace, success: bool = True) -> Reference:
+def reference(episode: Trace, success: bool = True, task: Task = TASK) -> Reference:
     """The expert's episode: that of ``episode``."""
-    return Reference.of(episode, SUCCEEDED if success else FAILED)
+    return Reference.of(task, episode, SUCCEEDED if success else FAILED)
 
 
 def outcome(seed: int, **changes: Any) -> Outcome:

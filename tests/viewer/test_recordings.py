@@ -32,7 +32,7 @@ def played() -> tuple[BimanualEnv, Trace, Outcome]:
     """The expert's episode of a seed, judged against itself."""
     env = BimanualEnv("table_lift")
     trace, ending = trace_episode(env, ScriptedExpert(env.task_spec, Noise(0.0)), 940_000)
-    return env, trace, score_episode(env.task_spec, 940_000, trace, Reference.of(trace, ending), ending)
+    return env, trace, score_episode(env.task_spec, 940_000, trace, Reference.of(env.task_spec, trace, ending), ending)
 
 
 def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path: Path) -> None:
@@ -42,7 +42,9 @@ def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path:
                     replace(e, attention={"table": 1.0}) for e in trace.explanations if e is not None]  # fmt: skip
     explanations[0] = replace(explanations[0], plan=trace.action[:10])
     wrong = replace(trace, explanations=tuple(explanations))
-    path = write_recording(tmp_path, EvaluatedEpisode(env, failed, wrong, Reference.of(trace, SUCCEEDED), IDENTITY))
+    path = write_recording(
+        tmp_path, EvaluatedEpisode(env, failed, wrong, Reference.of(env.task_spec, trace, SUCCEEDED), IDENTITY)
+    )
     assert path.name == "seed_0940000_failure.rrd"
     assert recording_name(outcome) == "seed_0940000_success"
     text = read_back(path)
