@@ -102,12 +102,17 @@ def _from_dataset(checkpoint: Checkpoint, training_data: Path | None) -> tuple[l
     if training_data is not None:
         if reason := _mismatch(checkpoint, training_data):
             raise ValueError(f"{training_data} is not the data set that {checkpoint.name} was trained on: {reason}")
-        roots = [training_data]
+        root = training_data
     else:
-        roots = [root for root in _candidates(checkpoint) if not _mismatch(checkpoint, root)]
-    if not roots:
+        root = find_training_data(checkpoint)
+    if root is None:
         return [], "the training data are not at hand, or are not what the checkpoint was trained on"
-    return _seeds_of(roots[0])
+    return _seeds_of(root)
+
+
+def find_training_data(checkpoint: Checkpoint) -> Path | None:
+    """The data set that ``train_config.json`` names, if it is here and has the statistics that the checkpoint keeps."""
+    return next((root for root in _candidates(checkpoint) if not _mismatch(checkpoint, root)), None)
 
 
 def _seeds_of(root: Path) -> tuple[list[TrainingSeeds], str]:

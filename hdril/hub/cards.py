@@ -14,6 +14,8 @@ from lerobot_policy_hdril.card import CITATION, EVALUATION
 from hdril.demonstrations.provenance import RECIPE_PATH, read_provenance
 from hdril.demonstrations.schema import features
 from hdril.digest import SHORT
+from hdril.evaluation.checkpoint import Checkpoint
+from hdril.evaluation.held_out import find_training_data
 from hdril.evaluation.results import headline
 from hdril.markdown import table
 from hdril.tasks import base_name, get_task
@@ -192,8 +194,11 @@ def with_evaluation(card: ModelCard, summary: dict[str, Any], repo_id: str) -> M
     return ModelCard(f"---\n{data.to_yaml()}\n---\n{text}")
 
 
-def checkpoint_card(checkpoint: Path, repo_id: str) -> str:
-    """The card that LeRobot would have published with this checkpoint, for its repository ``repo_id``."""
+def checkpoint_card(checkpoint: Checkpoint, repo_id: str) -> str:
+    """The card that LeRobot would have published with this checkpoint, for its repository ``repo_id``.
+
+    The training data are described only if they are still what the checkpoint was trained on.
+    """
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.configs.train import TrainPipelineConfig
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -201,13 +206,12 @@ def checkpoint_card(checkpoint: Path, repo_id: str) -> str:
     from lerobot.utils.import_utils import register_third_party_plugins
 
     register_third_party_plugins()
-    training = TrainPipelineConfig.from_pretrained(checkpoint)
-    dataset = training.dataset
-    here = dataset.root is not None and (Path(dataset.root) / "meta/info.json").exists()
-    metadata = LeRobotDatasetMetadata(dataset.repo_id, root=dataset.root) if here else None
-    config = PreTrainedConfig.from_pretrained(checkpoint)
+    training = TrainPipelineConfig.from_pretrained(checkpoint.folder)
+    dataset, root = training.dataset, find_training_data(checkpoint)
+    metadata = LeRobotDatasetMetadata(dataset.repo_id, root=root) if root is not None else None
+    config = PreTrainedConfig.from_pretrained(checkpoint.folder)
     config.repo_id = repo_id
-    policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
+    policy = get_policy_class(config.type).from_pretrained(checkpoint.folder, config=config)
     card = policy.generate_model_card(
         dataset.repo_id, config.type, config.license, config.tags, cfg=training, dataset_meta=metadata
     )

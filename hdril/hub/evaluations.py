@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from huggingface_hub import ModelCard
 
-from hdril.digest import SHORT, digest_file
-from hdril.evaluation.checkpoint import WEIGHTS
+from hdril.evaluation.checkpoint import CONFIG, PROCESSORS, WEIGHTS, Checkpoint, identify, resolve_config
 from hdril.evaluation.evaluate import Job, make_job
+from hdril.evaluation.identity import PolicyIdentity, differences
 from hdril.evaluation.results import headline
 from hdril.evaluation.stored import RESULTS, StoredEvaluation
 from hdril.hub.cards import checkpoint_card, folder_of, with_evaluation
-from hdril.hub.publish import download, publish, read_text
+from hdril.hub.publish import Head, download, publish, read_head, read_text
 
 PAGES = ("report.md", "report.png")
 """What goes up beside ``results.json``."""
@@ -24,6 +25,8 @@ CHECKPOINT_SUFFIXES = (".safetensors", ".json", ".yaml")
 
 def publish_evaluation(repo_id: str, job: Job, evaluation: StoredEvaluation, private: bool) -> str:
     """Put results, report and card into a model's repository, and the checkpoint if it lies here, in one commit.
+
+    If the repository holds another policy, its card is made anew, and the results of the other policy are removed.
 
     Args:
         repo_id: user/name.
@@ -35,23 +38,34 @@ def publish_evaluation(repo_id: str, job: Job, evaluation: StoredEvaluation, pri
         The address of the repository.
 
     Raises:
-        ValueError: the checkpoint is no longer the one that was evaluated, or the repository holds other weights.
-        HubError: the Hub cannot be reached, or refuses.
+        ValueError: the checkpoint is no longer the one that was evaluated; or it does not lie here, and the repository holds
+            another policy, or none.
+        HubError: the Hub cannot be reached, refuses, or somebody else changed the repository meanwhile.
     """
     _check_unchanged(job, evaluation)
-    summary = evaluation.results
+    head, summary = read_head(repo_id), evaluation.results
+    found = None if head is None else _policy_of(repo_id, head, job)
     files: dict[str, Path | bytes] = {f"{folder_of(summary)}/{name}": evaluation.folder / name for name in PAGES}
     files[f"{folder_of(summary)}/{RESULTS}"] = _portable(summary)
-    text = read_text(repo_id, "README.md", "model")
+    same = found == job.identity.policy
+    text = read_text(repo_id, "README.md", "model", head.revision) if head is not None and same else None
     if Path(job.checkpoint.name).is_dir():
         content = sorted(job.checkpoint.folder.iterdir())
         files |= {path.name: path for path in content if path.suffix in CHECKPOINT_SUFFIXES}
-        text = text or checkpoint_card(job.checkpoint.folder, repo_id)
+        text = text or checkpoint_card(job.checkpoint, repo_id)
     else:
-        _check_remote_weights(repo_id, job)
+        _check_holds(repo_id, found, job)
     card = with_evaluation(ModelCard(text or f"# {repo_id}\n"), summary, repo_id)
     files["README.md"] = str(card).encode()
-    return publish(repo_id, "model", files, headline(summary), private)
+    outdated = [] if same else _results_in(head)
+    if outdated:
+        print(f"Note: {repo_id} held another policy; its results go: {', '.join(outdated)}")
+    remove = [path for path in outdated if path not in files]
+    return publish(repo_id, "model", files, headline(summary), private, head=head, remove=remove)
+
+
+def _results_in(head: Head | None) -> list[str]:
+    return [] if head is None else [path for path in head.files if path.startswith("eval/")]
 
 
 def _portable(summary: dict[str, Any]) -> bytes:
@@ -69,11 +83,31 @@ def _check_unchanged(job: Job, evaluation: StoredEvaluation) -> None:
     evaluation.require(now.identity)
 
 
-def _check_remote_weights(repo_id: str, job: Job) -> None:
+def _policy_of(repo_id: str, head: Head, job: Job) -> PolicyIdentity | None:
+    """The policy in a repository, used as ``job`` used its own; None if it holds none that can be."""
+    paths = {name: download(repo_id, name, "model", head.revision) for name in (CONFIG, WEIGHTS, *PROCESSORS)}
+    config = paths[CONFIG]
+    if config is None or None in paths.values():
+        return None
+    checkpoint = Checkpoint(repo_id, config.parent)
+    try:
+        for path in checkpoint.processors:
+            if download(repo_id, path.name, "model", head.revision) is None:
+                return None
+        return identify(checkpoint, resolve_config(checkpoint, job.overrides, job.identity.policy.device))
+    except ValueError:  # of a type that is not installed, or damaged
+        return None
+
+
+def _check_holds(repo_id: str, found: PolicyIdentity | None, job: Job) -> None:
     """Results of a policy on the Hub must not go into the card of another."""
-    path, evaluated = download(repo_id, WEIGHTS, "model"), job.identity.policy.weights
-    if path is not None and (found := digest_file(path)) != evaluated:
+    if found is None:
         raise ValueError(
-            f"{repo_id} holds other weights ({found[:SHORT]} there, {evaluated[:SHORT]} evaluated): its card cannot show "
-            f"results of {job.checkpoint.name}; choose another repository"
+            f"{repo_id} holds no policy that could have these results: they can go to {job.checkpoint.name}, which was "
+            "evaluated, or to a copy of it"
+        )
+    if changed := differences(asdict(found), asdict(job.identity.policy)):
+        raise ValueError(
+            f"{repo_id} holds another policy, with other {', '.join(changed)}: its card cannot show results of "
+            f"{job.checkpoint.name}; choose another repository"
         )

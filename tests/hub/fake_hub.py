@@ -123,13 +123,18 @@ class FakeHub:
         return httpx.Response(200)
 
     def _commit(self, kind: str, name: str, repository: Repository, body: bytes) -> httpx.Response:
-        for line in body.decode().splitlines():
-            entry = json.loads(line)
+        entries = [json.loads(line) for line in body.decode().splitlines()]
+        parent = next(entry["value"] for entry in entries if entry["key"] == "header").get("parentCommit")
+        if parent not in (None, repository.revision):
+            return httpx.Response(412, json={"error": "the branch is not at that commit"})
+        for entry in entries:
             value = entry["value"]
             if entry["key"] == "file":
                 repository.files[value["path"]] = base64.b64decode(value["content"])
             elif entry["key"] == "lfsFile":
                 repository.files[value["path"]] = self.blobs[value["oid"]]
+            elif entry["key"] == "deletedFile":
+                del repository.files[value["path"]]
         repository.commits += 1
         prefix = "datasets/" if kind == "dataset" else ""
         url = f"https://huggingface.co/{prefix}{name}/commit/{repository.revision}"

@@ -24,13 +24,13 @@ from safetensors.torch import load_file, save_file
 import hdril.hub.publish
 from hdril.cli.eval import EvalConfig, PolicySource, eval_command
 from hdril.cli.record import RecordConfig, record_command
-from hdril.evaluation.checkpoint import Checkpoint
+from hdril.evaluation.checkpoint import Checkpoint, find_checkpoint
 from hdril.evaluation.evaluate import Worker, make_job
 from hdril.evaluation.stored import read_evaluation
-from hdril.hub.cards import with_evaluation
+from hdril.hub.cards import checkpoint_card, with_evaluation
 from hdril.hub.evaluations import publish_evaluation
 from hdril.hub.publish import HubError, publish
-from tests.evaluation.checkpoints import save_hdril
+from tests.evaluation.checkpoints import save_act, save_hdril
 from tests.evaluation.test_identity import finish
 from tests.hub.fake_hub import FakeHub
 
@@ -181,20 +181,141 @@ def test_results_of_other_weights_are_not_published(hub: FakeHub, checkpoint: Pa
     assert not hub.repositories
 
 
-def test_results_do_not_go_into_the_card_of_other_weights(hub: FakeHub, checkpoint: Path, tmp_path: Path) -> None:
-    """A policy of the Hub has no files here that could go along: the repository must hold the same weights, or none."""
+def files_of(checkpoint: Path) -> dict[str, Path | bytes]:
+    """What a repository of this checkpoint holds."""
+    return {path.name: path for path in checkpoint.iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"model.safetensors": b"of another policy"}, r"with other weights \(\w{12} there, \w{12} here\)"),
+        ({"config.json": {"rollout": "open_loop"}}, r"with other config \(\w{12} there, \w{12} here\)"),
+        ({"policy_postprocessor.json": {"name": "another"}}, r"with other processors \(\w{12} there, \w{12} here\)"),
+    ],
+)
+def test_results_do_not_go_into_the_card_of_another_policy(
+    hub: FakeHub, checkpoint: Path, tmp_path: Path, change: dict, message: str
+) -> None:
+    """A policy of the Hub has no files here that could go along: the repository must hold the very same."""
     job = make_job("table_lift", Checkpoint("user/lifter", checkpoint), 700_003, 1)
     evaluation = read_evaluation(finish(job, tmp_path / "eval"))
-    publish("user/other", "model", {"model.safetensors": b"of another policy"}, "message", private=True)
-    with pytest.raises(ValueError, match=r"user/other holds other weights \(\w{12} there, \w{12} evaluated\)"):
+    content = files_of(checkpoint)
+    for name, new in change.items():
+        old = json.loads((checkpoint / name).read_text()) if isinstance(new, dict) else {}
+        content[name] = json.dumps(old | new).encode() if isinstance(new, dict) else new
+    publish("user/other", "model", content, "message", private=True)
+    before = dict(hub.repositories["model", "user/other"].files)
+    with pytest.raises(ValueError, match=rf"user/other holds another policy, {message}: its card cannot show"):
         publish_evaluation("user/other", job, evaluation, private=True)
-    assert set(hub.repositories["model", "user/other"].files) == {"model.safetensors"}
-    publish("user/other", "model", {"model.safetensors": checkpoint / "model.safetensors"}, "message", private=True)
+    assert hub.repositories["model", "user/other"].files == before
+    publish("user/other", "model", files_of(checkpoint), "message", private=True)
     publish_evaluation("user/other", job, evaluation, private=True)
     card = hub.repositories["model", "user/other"].files["README.md"].decode()
     assert f"weights with the SHA-256 `{job.identity.policy.weights[:12]}…`" in card
     assert "pybullet" in card
     assert "Whether the seeds are held out is not known: it is a test." in card
+
+
+@pytest.mark.parametrize("missing", ["", "model.safetensors", "config.json", "policy_preprocessor.json"])
+def test_results_of_a_policy_do_not_go_where_there_is_none(
+    hub: FakeHub, checkpoint: Path, tmp_path: Path, missing: str
+) -> None:
+    """No repository at all, or one whose policy is not whole."""
+    job = make_job("table_lift", Checkpoint("user/lifter", checkpoint), 700_003, 1)
+    evaluation = read_evaluation(finish(job, tmp_path / "eval"))
+    if missing:
+        content = files_of(checkpoint)
+        del content[missing]
+        publish("user/other", "model", content, "message", private=True)
+    commits = {name: repository.commits for name, repository in hub.repositories.items()}
+    with pytest.raises(ValueError, match=r"user/other holds no policy that could have these results: .* user/lifter"):
+        publish_evaluation("user/other", job, evaluation, private=True)
+    assert {name: repository.commits for name, repository in hub.repositories.items()} == commits
+
+
+def test_what_is_pushed_meanwhile_is_not_overwritten(
+    hub: FakeHub, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between the look at the repository and the commit, somebody pushes another policy there."""
+    job = make_job("table_lift", Checkpoint("user/lifter", checkpoint), 700_003, 1)
+    evaluation = read_evaluation(finish(job, tmp_path / "eval"))
+    publish("user/lifter", "model", files_of(checkpoint), "message", private=True)
+    repository = hub.repositories["model", "user/lifter"]
+    answer = hub.answer
+
+    def races(request: httpx.Request) -> httpx.Response:
+        if "/preupload/" in request.url.path:
+            repository.files["model.safetensors"] = b"of another policy"
+            repository.commits = 2
+        return answer(request)
+
+    monkeypatch.setattr(hub, "answer", races)
+    set_client_factory(hub.client)
+    with pytest.raises(HubError, match="412, somebody else has changed it since it was read"):
+        publish_evaluation("user/lifter", job, evaluation, private=True)
+    assert not vars(hub)["waits"]
+    assert "README.md" not in repository.files
+
+
+def test_card_and_results_of_another_policy_do_not_outlive_it(hub: FakeHub, dataset: Path, tmp_path: Path) -> None:
+    """A policy is published with results of two tasks; then another one goes into the same repository."""
+
+    def push(name: str, task: str, seed: int) -> None:
+        job = make_job(task, str(tmp_path / name), seed, 1)
+        output = tmp_path / f"eval_{name}_{seed}"
+        publish_evaluation("user/lifter", job, read_evaluation(finish(job, output)), private=True)
+
+    save_hdril(tmp_path / "first", dataset)
+    save_hdril(tmp_path / "second", dataset, episodes=(0, 1, 2))
+    push("first", "table_lift", 10)
+    files = hub.repositories["model", "user/lifter"].files
+    push("first", "table_lift:level=varied", 20)
+    files["notes.txt"] = b"kept"
+
+    def card() -> str:
+        return files["README.md"].decode()
+
+    assert "| episodes learned from | 6 |" in squeeze(card())
+    assert len(ModelCard(card()).data.to_dict()["model-index"][0]["results"]) == 2
+    push("second", "table_lift", 30)
+    assert "| episodes learned from | 3 |" in squeeze(card())
+    assert len(ModelCard(card()).data.to_dict()["model-index"][0]["results"]) == 1
+    assert {name.split("/")[1] for name in files if name.startswith("eval/")} == {"table_lift_30"}
+    assert files["notes.txt"] == b"kept"
+    assert files["model.safetensors"] == (tmp_path / "second/model.safetensors").read_bytes()
+    push("second", "table_lift:level=varied", 20)  # of this very policy: both are kept
+    assert len({name.split("/")[1] for name in files if name.startswith("eval/")}) == 2
+    assert len(ModelCard(card()).data.to_dict()["model-index"][0]["results"]) == 2
+
+
+def test_a_policys_card_describes_only_what_it_learned_from(hub: FakeHub, dataset: Path, tmp_path: Path) -> None:
+    """Another dataset of another task is recorded at the path that training was given."""
+    root = Path(shutil.copytree(dataset, tmp_path / "data"))
+    policies = [
+        find_checkpoint(str(save(tmp_path / name, root)))
+        for name, save in (("hdril", save_hdril), ("act", lambda folder, data: save_act(folder, data, str(data))))
+    ]
+
+    def rows() -> list[str]:
+        return [squeeze(checkpoint_card(policy, "user/policy")) for policy in policies]
+
+    ours, theirs = rows()
+    for line in ("# HDR-IL: table_lift", "| episodes learned from | 6 |", "| episodes | 6 |", "--task=table_lift"):
+        assert line in ours
+    for name, change in (
+        ("info.json", {"total_episodes": 999, "robot_type": "another"}),
+        ("hdril.json", {"recipe": {"task": "peg_in_hole"}}),
+        ("stats.json", {"action": {"mean": [0.0] * 16, "std": [1.0] * 16}}),
+    ):
+        file = root / "meta" / name
+        file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    ours, theirs = rows()
+    assert "# HDR-IL: table_lift" in ours
+    assert "| episodes learned from | 6 |" in ours
+    for word in ("| episodes |", "999", "another", "peg_in_hole"):
+        assert word not in ours
+        assert word not in theirs or word == "| episodes |"
 
 
 def test_card_without_a_place_for_results_gets_one() -> None:

@@ -30,8 +30,13 @@ _CHOICES = ("preset", "interaction", "skip", "state_skip", "per_primitive", "dec
             "replan_every", "hidden_dim")  # fmt: skip
 
 
-def simulated_task(dataset_meta: LeRobotDatasetMetadata | None) -> str | None:
-    """The task of ``--env.type=hdril`` that a dataset is of; None if hdril did not record it."""
+def simulated_task(config: HDRILConfig, dataset_meta: LeRobotDatasetMetadata | None) -> str | None:
+    """The task of ``--env.type=hdril`` that a policy learned; None if hdril did not record its dataset.
+
+    The checkpoint's own record decides. The dataset is asked only about a policy without one.
+    """
+    if config.training_data and config.training_data[-1].digest:
+        return config.training_data[-1].task
     recipe = None if dataset_meta is None else read_told(Path(dataset_meta.root))[0]
     return None if recipe is None else recipe.get("task")
 
@@ -50,7 +55,7 @@ def model_card(
         license=license, library_name="lerobot", pipeline_tag="robotics", model_name="hdril", datasets=dataset_repo_id,
         tags=sorted({*TAGS, *(tags or [])}),
     )  # fmt: skip
-    task = simulated_task(dataset_meta)
+    task = simulated_task(config, dataset_meta)
     command = (
         f"lerobot-eval --policy.path={repo_id} --env.type=hdril --env.task={task or '<task>'} --eval.n_episodes=100"
     )
