@@ -119,6 +119,8 @@ class Task:
     """What follows from the places that were drawn, such as a rack that stands on the side where the bar does not lie."""
     length: int | None = None
     """Frames of the shortest plan; the sum of the primitives unless given. Some plans skip primitives."""
+    longest: int | None = None
+    """Frames of the longest plan; those of the shortest unless given."""
     variation: Variation = NOMINAL
     detailed: bool = False
     """Whether ``also_observed`` and ``attributes`` are observed."""
@@ -164,8 +166,10 @@ class Task:
 
     @property
     def budget(self) -> int:
-        """Frames after which an episode is cut unless it is said otherwise: more than the horizon if something may happen."""
-        return self.horizon * (PATIENCE if self.variation.disturbed else 1)
+        """Frames after which an episode is cut unless it is said otherwise: those of the longest plan if nothing can happen."""
+        if self.variation.disturbed:
+            return PATIENCE * (self.longest or self.horizon)
+        return self.horizon if self.longest is None else self.longest + self.dwell
 
     def sample(self, seed: int) -> Scenario:
         """The scene of a seed.
