@@ -5,22 +5,27 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
 from hdril.cli.common import check_repo_id, run
+from hdril.evaluation.checkpoint import resolve_config
 from hdril.evaluation.evaluate import Job, evaluate, make_job
 from hdril.evaluation.held_out import HeldOut, check_held_out
 from hdril.evaluation.journal import Journal
 from hdril.evaluation.lerobot_actor import foreign_primitives
+from hdril.evaluation.observation import check_observation, observes_details
 from hdril.evaluation.report import write_report
 from hdril.evaluation.results import Comparison, Run, compare, headline
 from hdril.evaluation.score import Outcome
 from hdril.evaluation.stored import StoredEvaluation, read_evaluation
+from hdril.evaluation.suite import check_suite
 from hdril.files import MAX_SEED
 from hdril.tasks import get_task
 from hdril.viewer.keep import check_keep
@@ -66,6 +71,11 @@ class EvalConfig:
     seed."""
     rerun: str = "failures"
     """Episodes to keep as Rerun recordings: failures, all, none, or a number of episodes from the first on."""
+    suite: str = ""
+    """Name of a suite: the policy plays all its cells, each in a folder of its own, and one table compares them. factors: the
+    nominal task, each factor alone, all factors (varied), each event alone, and all factors with an event (hard)."""
+    cells: str = ""
+    """Cells of the suite, separated by commas; all unless given. The nominal one and the controls come with them."""
     output_dir: Path | None = None
     """Folder of the results; must not exist. Default: outputs/eval/<task>_<time>."""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
@@ -79,6 +89,14 @@ class EvalConfig:
 
 def _check(config: EvalConfig) -> None:
     get_task(config.task)
+    if config.suite:
+        check_suite(config.suite, config.task)
+        if alone := [name for name in ("push", "max_frames") if getattr(config, name)]:
+            raise ValueError(
+                f"{alone[0]} is an option of one evaluation, not of a suite: give the task of a cell instead"
+            )
+    elif config.cells:
+        raise ValueError("cells are those of a suite: add --suite=factors")
     if config.push:
         check_repo_id("push", config.push)
     for name, least in (("num_episodes", 1), ("seed", 0), ("workers", 1)):
@@ -102,10 +120,19 @@ def eval_command(config: EvalConfig, overrides: tuple[str, ...] = ()) -> None:
     held_out = check_held_out(job.checkpoint, config.task, job.seeds, config.training_data)
     if not held_out.known:
         print(f"Note: whether these seeds are held out is not known: {held_out.basis}.")
+    policy, task = resolve_config(job.checkpoint, overrides, config.policy.device), get_task(config.task)
+    if config.suite:
+        from hdril.cli.suite import evaluate_suite  # it evaluates each cell by what is defined here
+
+        evaluate_suite(config, job, observes_details(policy, job.checkpoint.name, task), held_out, output)
+        return
+    check_observation(policy, job.checkpoint.name, task)
     if output.exists():
-        _check_finished(read_evaluation(output), config, job)
+        check_finished(read_evaluation(output), config, job)
     else:
-        _evaluate(config, job, describe(job, held_out), output)
+        start = time.monotonic()
+        summary = evaluate_into(output, config, job, held_out)
+        _announce(summary, output, time.monotonic() - start)
     if config.push:
         _push(config, job, output)
 
@@ -130,23 +157,30 @@ def describe(job: Job, held_out: HeldOut) -> Run:
     )
 
 
-def _check_finished(evaluation: StoredEvaluation, config: EvalConfig, job: Job) -> None:
+def check_finished(evaluation: StoredEvaluation, config: EvalConfig, job: Job) -> None:
     """Raises ValueError unless a finished evaluation is the one that is asked for."""
     evaluation.require(job.identity)
     if (against := _read_other(config.against, job)) is not None:
         evaluation.require_comparison(against)
 
 
-def _evaluate(config: EvalConfig, job: Job, what: Run, output: Path) -> None:
+def evaluate_into(
+    output: Path, config: EvalConfig, job: Job, held_out: HeldOut, pool: ProcessPoolExecutor | None = None
+) -> dict[str, Any]:
+    """Evaluate a job, in ``pool`` if it is given, and write the report to ``output``; returns the data of ``results.json``."""
     against = _read_other(config.against, job)
-    journal, start = Journal(output, job.identity), time.monotonic()
+    journal = Journal(output, job.identity)
     with journal.writing() as add:
-        _play(config, job, journal, add)
+        _play(config, job, journal, add, pool)
         outcomes = sorted(journal.done.values(), key=lambda outcome: outcome.seed)
-        summary = write_report(journal.folder, what, outcomes, _compare(outcomes, against))
+        summary = write_report(journal.folder, describe(job, held_out), outcomes, _compare(outcomes, against))
         journal.finish()
+    return summary
+
+
+def _announce(summary: Mapping[str, Any], output: Path, seconds: float) -> None:
     recordings = sorted((output / "rerun").glob("*.rrd")) if (output / "rerun").exists() else []
-    print(f"{headline(summary)}; {time.monotonic() - start:.0f} s")
+    print(f"{headline(summary)}; {seconds:.0f} s")
     print(f"Report: {output / 'report.md'}")
     if recordings:
         print(f"{len(recordings)} recordings: hdril-view --run={output}")
@@ -165,7 +199,13 @@ def _compare(outcomes: list[Outcome], against: StoredEvaluation | None) -> Compa
     return None if against is None else compare(against.results["policy"], outcomes, against.results)
 
 
-def _play(config: EvalConfig, job: Job, journal: Journal, add: Callable[[Outcome], None]) -> None:
+def _play(
+    config: EvalConfig,
+    job: Job,
+    journal: Journal,
+    add: Callable[[Outcome], None],
+    pool: ProcessPoolExecutor | None,
+) -> None:
     """Play the seeds that are left, adding to the journal as they come."""
     left = [seed for seed in job.seeds if seed not in journal.done]
     if not left:
@@ -173,7 +213,7 @@ def _play(config: EvalConfig, job: Job, journal: Journal, add: Callable[[Outcome
     writer = RecordingWriter(journal.folder / "rerun", config.rerun, config.seed) if config.rerun != "none" else None
     with (
         tqdm(total=len(job.seeds), initial=len(journal.done), desc=f"evaluating {job.task}", unit="episode") as bar,
-        closing(evaluate(job, left, min(config.workers, len(left)), writer)) as stream,
+        closing(evaluate(job, left, min(config.workers, len(left)), writer, pool)) as stream,
     ):
         for outcome in stream:
             add(outcome)

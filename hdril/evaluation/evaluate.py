@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from concurrent.futures import Future
-from contextlib import closing
+from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, field, replace
 
 from hdril.env import BimanualEnv
@@ -121,6 +121,9 @@ def _work(job: Job, seed: int, sink: EpisodeSink | None) -> Outcome:
     # Built by the first call and not by the pool's initializer, whose errors reach nobody.
     key = repr(job)
     if key not in _workers:
+        for worker in _workers.values():  # of another job in the same pool, which is over
+            worker.env.close()
+        _workers.clear()
         _workers[key] = Worker(job)
     return _finish(_workers[key].play(seed), sink)
 
@@ -131,17 +134,24 @@ def _finish(episode: EvaluatedEpisode, sink: EpisodeSink | None) -> Outcome:
     return episode.outcome
 
 
-def evaluate(job: Job, seeds: list[int], workers: int = 1, sink: EpisodeSink | None = None) -> Generator[Outcome]:
+def evaluate(
+    job: Job,
+    seeds: list[int],
+    workers: int = 1,
+    sink: EpisodeSink | None = None,
+    pool: ProcessPoolExecutor | None = None,
+) -> Generator[Outcome]:
     """Outcomes in the order of ``seeds``, the same for any number of workers: each plays one episode at a time.
 
-    ``sink`` is given every episode, in the process that played it.
+    ``sink`` is given every episode, in the process that played it. ``pool`` is used if it is given, for one job after the
+    other; otherwise ``workers`` processes are started for this job.
     """
-    if workers == 1:
+    if workers == 1 and pool is None:
         worker = Worker(job)
         with closing(worker.env):
             yield from (_finish(worker.play(seed), sink) for seed in seeds)
         return
-    with worker_pool(workers) as pool:
-        futures: list[Future[Outcome]] = [pool.submit(_work, job, seed, sink) for seed in seeds]
+    with worker_pool(workers) if pool is None else nullcontext(pool) as processes:
+        futures: list[Future[Outcome]] = [processes.submit(_work, job, seed, sink) for seed in seeds]
         for future in futures:
             yield future.result()

@@ -8,7 +8,7 @@ from typing import Any
 
 from hdril.digest import SHORT
 from hdril.evaluation.software import evaluation_software
-from hdril.tasks import base_name, get_task, task_parameters
+from hdril.tasks import DETAILED, base_name, get_task, task_parameters
 
 Values = Mapping[str, Any]
 
@@ -44,7 +44,8 @@ class TrialsIdentity:
     task: str
     """Its name, without parameters."""
     parameters: dict[str, float]
-    """Of the task, with the defaults of those that were not given."""
+    """Of the task, with the defaults of those that were not given; what of the scene is observed is left out, because policies
+    that observe other things can be compared."""
     first_seed: int
     num_episodes: int
     max_frames: int
@@ -77,7 +78,8 @@ def identify_trials(task: str, first_seed: int, num_episodes: int, max_frames: i
             f"max_frames must be at least {horizon}, the horizon of {task}, from which on success is judged; got {frames}"
         )
     software = evaluation_software(base_name(task))
-    return TrialsIdentity(base_name(task), task_parameters(task), first_seed, num_episodes, frames, software)
+    parameters = {name: value for name, value in task_parameters(task).items() if name != DETAILED}
+    return TrialsIdentity(base_name(task), parameters, first_seed, num_episodes, frames, software)
 
 
 def _leaves(values: Values, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:

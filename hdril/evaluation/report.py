@@ -46,6 +46,7 @@ def markdown(summary: Mapping[str, Any], outcomes: Sequence[Outcome]) -> str:
         *_order(summary["pc_expert_order"]),
         *_comparison(summary["comparison"]),
         *_planner(summary["planner"], get_task(summary["task"]).labels),
+        *_events([outcome for outcome in outcomes if outcome.events], get_task(summary["task"]).physics.control_period),
         *(_failures(summary, failures) if failures else []),
     ]
     return "\n\n".join(blocks) + "\n"
@@ -121,6 +122,18 @@ def _planner(planner: Mapping[str, Any] | None, labels: tuple[str, ...]) -> list
         "(row) at which it prefers each (column):",
         table(("", *labels), [[name, *(count or "" for count in row)] for name, row in rows]),
     ]
+
+
+def _events(disturbed: Sequence[Outcome], period: float) -> list[str]:
+    """What happened to the episodes, and when."""
+    if not disturbed:
+        return []
+    rows = [
+        [outcome.seed, f"{period * frame:.1f}", event, "success" if outcome.success else f"failure: {outcome.unmet}"]
+        for outcome in disturbed
+        for frame, event in outcome.events
+    ]
+    return ["## Events", table(("seed", "at, s", "event", "outcome"), rows)]
 
 
 def _failures(summary: Mapping[str, Any], failures: Sequence[Outcome]) -> list[str]:

@@ -24,6 +24,7 @@ key                                   meaning
 ``angle_error_rad``                   spread of :attr:`Outcome.angle_error_rad`, rad; null likewise
 ``dtw_cm``                            spread of :attr:`Outcome.dtw_cm`, cm; null likewise
 ``position_error_cm_by_primitive``    spread by name of the expert's primitive, cm; without primitives that were not reached
+``motion``                            spread of each number of :class:`hdril.evaluation.motion.Motion`, by name
 ``stages_reached``                    episodes by the last stage reached: a stage, ``none`` or ``success``
 ``pc_expert_order``                   episodes in which the policy played the expert's order of primitives, % of those with
                                       primitives; null for a policy without
@@ -134,6 +135,7 @@ def summarise(run: Run, outcomes: Sequence[Outcome], comparison: Comparison | No
         "angle_error_rad": _spread([outcome.angle_error_rad for outcome in compared]),
         "dtw_cm": _spread([outcome.dtw_cm for outcome in compared]),
         "position_error_cm_by_primitive": _by_primitive(compared, get_task(run.task).labels),
+        "motion": {name: _spread([outcome.motion[name] for outcome in outcomes]) for name in outcomes[0].motion},
         "stages_reached": dict(Counter(outcome.stage or "none" for outcome in outcomes)),
         "pc_expert_order": _expert_order(outcomes, tuple(p.name for p in get_task(run.task).primitives)),
         "planner": _planner(outcomes),
