@@ -258,7 +258,7 @@ def _bodies(grips: Grips) -> tuple[str, ...]:
 # ---------------------------------------------------------------------- needs
 
 
-def holding(grips: Grips, tolerance: float = 0.03, thinnest: float = 0.2) -> Need:
+def holding(grips: Grips, tolerance: float = 0.03, thinnest: float = 0.1) -> Need:
     """Each hand holds what it grips: it was told to close, it is within ``tolerance`` m of its grip, and it is not empty.
 
     A hand that closes on nothing is open by less than ``thinnest`` (0 to 1).

@@ -7,11 +7,13 @@ arm cannot do it and the jaws close on nothing but the handles.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hdril.geometry import Pose
+from hdril.simulation.actions import HandCommand
 from hdril.simulation.bodies import BodySpec, Box
 from hdril.simulation.robots.spec import SIDES
 from hdril.simulation.world import ROBOT
@@ -21,7 +23,9 @@ from hdril.tasks.events import EventSpec
 from hdril.tasks.factors import Factor
 from hdril.tasks.primitives import (
     Grip,
+    Hands,
     Need,
+    Primitive,
     Scene,
     extend,
     grasp,
@@ -38,7 +42,7 @@ DEPTH, WIDTH, TOP = 0.35, 0.85, 0.30
 BOARD = 0.06  # thicker than the jaws are wide, so that the board itself cannot be pinched
 HANDLE_Y, GRIP_HEIGHT = 0.41, 0.355
 LEG_X, LEG_Y, LEG = 0.10, 0.35, 0.04
-PLATFORM_HEIGHT, PLATFORM_X, PLATFORM_DEPTH = 0.12, 0.98, 0.30
+PLATFORM_HEIGHT, PLATFORM_X, PLATFORM_DEPTH, PLATFORM_WIDTH = 0.12, 0.98, 0.30, 0.90
 MOVED_X = 0.66
 
 WOOD, DARK, STEEL = (0.80, 0.62, 0.42, 1.0), (0.45, 0.31, 0.20, 1.0), (0.35, 0.42, 0.50, 1.0)
@@ -89,7 +93,7 @@ def _platform_height(values: Values) -> float:
 
 def _platform(values: Values) -> BodySpec:
     height = _platform_height(values)
-    return BodySpec("platform", (Box((PLATFORM_DEPTH, 0.90, height), (0.0, 0.0, height / 2), STEEL),))
+    return BodySpec("platform", (Box((PLATFORM_DEPTH, PLATFORM_WIDTH, height), (0.0, 0.0, height / 2), STEEL),))
 
 
 def admissible(poses: dict[str, Pose], values: Values) -> bool:
@@ -103,13 +107,47 @@ def admissible(poses: dict[str, Pose], values: Values) -> bool:
 
 # Hands pitched 45 degrees, down and forward, jaws across the handles.
 _PITCH = Rotation.from_matrix(np.array([[-1, 0, 1], [0, np.sqrt(2), 0], [-1, 0, -1]]) / np.sqrt(2)).as_quat()
+PITCH = 45.0
+
+
+def _turned(degrees: float) -> Pose:
+    """A turn about the jaws' axis, which pitches a hand down by ``degrees``."""
+    half = 0.5 * math.radians(degrees)
+    return Pose((0.0, 0.0, 0.0), (0.0, math.sin(half), 0.0, math.cos(half)))
+
+
+def _pitch(hand: Pose) -> float:
+    """How far a hand points down, deg."""
+    return math.degrees(math.asin(min(1.0, max(-1.0, -hand.rotation_matrix()[2, 2]))))
+
+
+def _ramp(value: float, start: float, end: float) -> float:
+    """0 up to ``start``, 1 from ``end`` on, and linear between them."""
+    return min(1.0, max(0.0, (value - start) / (end - start)))
 
 
 def _grip(sign: float) -> Grip:
-    """The handle on the table's left (1) or right (-1)."""
+    """The handle on the table's left (1) or right (-1).
+
+    Where the table stands nearly square, the hand is pitched down by 45 degrees. It is steeper at a handle that is turned
+    towards the robot, which is too near for a flat hand. At one that is turned away and far aside, the jaws must point another
+    way than the forearm: the hand is steeper there too, and turned outwards as far as the jaws' width allows. Where the platform
+    is far, the hand takes the end of the handle that is nearer to the robot.
+    """
 
     def pose(scene: Scene) -> Pose:
-        return Pose((0.0, sign * HANDLE_Y * (scene.attributes["table.length"] / WIDTH), GRIP_HEIGHT), _PITCH)
+        table, y = scene.objects["table"], sign * HANDLE_Y * (scene.attributes["table.length"] / WIDTH)
+        forwards = table.rotation_matrix()[:, 0]
+        yaw = sign * math.degrees(math.atan2(forwards[1], forwards[0]))
+        aside = sign * (table @ Pose((0.0, y, GRIP_HEIGHT))).position[1]
+        near = 30.0 * _ramp(yaw, 3.0, 10.0) + 5.0 * _ramp(yaw, 18.0, 28.0)
+        away = _ramp(-yaw, 9.0, 15.0) * _ramp(aside, 0.46, 0.54)
+        nearer = max(0.015 * away, 0.02 * _far(scene))
+        grip = Pose((-nearer, y, GRIP_HEIGHT), _PITCH)
+        if away:
+            half = 0.5 * sign * math.radians(10.0 * away)
+            grip = Pose(grip.position, (Pose((0, 0, 0), (0.0, 0.0, math.sin(half), math.cos(half))) @ grip).quaternion)
+        return grip @ _turned(near + 20.0 * away) if near or away else grip
 
     return Grip("table", pose)
 
@@ -130,14 +168,48 @@ def before_platform(scene: Scene) -> float:
     return min(MOVED_X, front - legs - 0.05)
 
 
-def platform_x(scene: Scene) -> float:
-    """Where the platform stands, x, m."""
-    return float(scene.objects["platform"].position[0])
+def goal_x(scene: Scene) -> float:
+    """Where the table goes on the platform, x, m: its middle, or nearer to the robot if the platform is far away.
+
+    The middles of the front legs stay on the platform, 5 mm from its edge or more.
+    """
+    x = float(scene.objects["platform"].position[0])
+    spare = PLATFORM_DEPTH / 2 - LEG_X * scene.attributes["table.depth"] / DEPTH - 0.005
+    return x - min(max(x - PLATFORM_X, 0.0), spare)
 
 
-def platform_y(scene: Scene) -> float:
-    """Where the platform stands, y, m."""
-    return float(scene.objects["platform"].position[1])
+def goal_y(scene: Scene) -> float:
+    """Where the table goes on the platform, y, m: in front of the robot, or as near to that as the legs allow."""
+    y = float(scene.objects["platform"].position[1])
+    spare = PLATFORM_WIDTH / 2 - LEG_Y * scene.attributes["table.length"] / WIDTH - 0.005
+    return y - min(max(y, -spare), spare)
+
+
+def _far(scene: Scene) -> float:
+    """0 where the table goes as far as in the nominal scene, or less far, 1 where it goes 4 cm further, or more."""
+    return _ramp(goal_x(scene), PLATFORM_X, PLATFORM_X + 0.04)
+
+
+def _carrying_pitch(scene: Scene) -> float:
+    """How far hands that carry the table point down, deg: 45, and less if the way is long: a flat hand reaches further."""
+    return PITCH - 12.0 * _far(scene)
+
+
+def _levelling(primitive: Primitive) -> Primitive:
+    """The primitive, at whose end the hands are pitched to carry the table: they turn about their grips while it stands."""
+    (segment,) = primitive.segments
+
+    def goal(scene: Scene) -> Hands:
+        hands = segment.goal(scene)
+        pitch = _carrying_pitch(scene)
+        return {side: HandCommand(_levelled(hand.pose, pitch), hand.opening) for side, hand in hands.items()}
+
+    return replace(primitive, segments=(replace(segment, goal=goal),))
+
+
+def _levelled(hand: Pose, pitch: float) -> Pose:
+    steeper = _pitch(hand) - pitch
+    return hand @ _turned(-steeper) if abs(steeper) > 0.5 else hand
 
 
 def _raised(scene: Scene) -> bool:
@@ -145,8 +217,8 @@ def _raised(scene: Scene) -> bool:
 
 
 def _over_platform(scene: Scene) -> bool:
-    offset = scene.objects["table"].position[:2] - scene.objects["platform"].position[:2]
-    return _raised(scene) and math.hypot(*offset) < 0.05
+    x, y, _ = scene.objects["table"].position
+    return _raised(scene) and math.hypot(x - goal_x(scene), y - goal_y(scene)) < 0.05
 
 
 RAISED = Need("table raised", _raised)
@@ -173,9 +245,9 @@ def make_scene(values: Values) -> Task:
         attributes=(("table.length", WIDTH * length), ("table.depth", DEPTH * depth), ("platform.height", height)),
         primitives=(
             grasp(GRIPS),
-            move("table", x=before_platform, y=0.0).needing(HELD, ON_BENCH),
+            _levelling(move("table", x=before_platform, y=0.0)).needing(HELD, ON_BENCH),
             lift("table", lambda scene: height_of_platform(scene) + 0.06).needing(HELD),
-            extend("table", x=platform_x, y=platform_y, follows=("platform",)).needing(HELD, RAISED),
+            extend("table", x=goal_x, y=goal_y, follows=("platform",)).needing(HELD, RAISED),
             place("table", height_of_platform).needing(HELD),
             retract().needing(ON_PLATFORM),
         ),
