@@ -124,3 +124,16 @@ def test_recorded_actions_are_played_from_the_start_after_a_reset() -> None:
         assert run_episode(cast(BimanualEnv, env), actor, 0).frames == 5
         actions.append(np.stack(env.actions))
     np.testing.assert_array_equal(*actions)
+
+
+def test_an_actor_that_gives_up_ends_the_episode_as_a_failure() -> None:
+    class GivesUp(Counter):
+        def act(self, observation: Observation) -> Decision:
+            if observation["agent_pos"][0] == 3:
+                raise StopIteration("nothing can be done")
+            return super().act(observation)
+
+    log = Log()
+    ending = run_episode(cast(BimanualEnv, Countdown(5, success=True)), GivesUp(), 0, log)
+    assert ending == Ending(False, "table upright, table at rest", 3)
+    assert len(log.seen) == 3

@@ -6,7 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -165,7 +165,7 @@ def check_finished(evaluation: StoredEvaluation, config: EvalConfig, job: Job) -
 
 
 def evaluate_into(
-    output: Path, config: EvalConfig, job: Job, held_out: HeldOut, pool: ProcessPoolExecutor | None = None
+    output: Path, config: EvalConfig, job: Job, held_out: HeldOut, pool: Executor | None = None
 ) -> dict[str, Any]:
     """Evaluate a job, in ``pool`` if it is given, and write the report to ``output``; returns the data of ``results.json``."""
     against = _read_other(config.against, job)
@@ -204,7 +204,7 @@ def _play(
     job: Job,
     journal: Journal,
     add: Callable[[Outcome], None],
-    pool: ProcessPoolExecutor | None,
+    pool: Executor | None,
 ) -> None:
     """Play the seeds that are left, adding to the journal as they come."""
     left = [seed for seed in job.seeds if seed not in journal.done]

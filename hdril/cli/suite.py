@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -62,7 +62,7 @@ def _identity(config: EvalConfig, jobs: dict[str, Job]) -> dict[str, Any]:
 
 
 @contextmanager
-def _pool(workers: int) -> Iterator[ProcessPoolExecutor | None]:
+def _pool(workers: int) -> Iterator[Executor | None]:
     """One pool for all cells: a process takes seconds to import what a policy needs."""
     if workers == 1:
         yield None
@@ -72,7 +72,7 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor | None]:
 
 
 def _evaluate_cell(
-    output: Path, config: EvalConfig, job: Job, held_out: HeldOut, pool: ProcessPoolExecutor | None
+    output: Path, config: EvalConfig, job: Job, held_out: HeldOut, pool: Executor | None
 ) -> dict[str, Any]:
     """The results of a cell, from before if it is finished."""
     against = None if config.against is None else config.against / output.name

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Executor, Future
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, field, replace
 
@@ -139,7 +139,7 @@ def evaluate(
     seeds: list[int],
     workers: int = 1,
     sink: EpisodeSink | None = None,
-    pool: ProcessPoolExecutor | None = None,
+    pool: Executor | None = None,
 ) -> Generator[Outcome]:
     """Outcomes in the order of ``seeds``, the same for any number of workers: each plays one episode at a time.
 

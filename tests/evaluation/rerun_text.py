@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 from rerun.experimental import RrdReader
 
@@ -26,8 +27,15 @@ def states(text: str, lane: str) -> set[str]:
 
 def value_of(path: Path, entity: str, component: str) -> str:
     """The first value of a component of an entity, whole: printed recordings cut long texts."""
+    return values_of(path, entity, component)[0]
+
+
+def values_of(path: Path, entity: str, component: str) -> list[Any]:
+    """The values of a component of an entity, chunk by chunk, one a row."""
+    found: list[Any] = []
     for chunk in RrdReader(path).store().stream().to_chunks():
         columns = chunk.to_record_batch().to_pydict()
         if str(chunk.entity_path) == entity and component in columns:
-            return columns[component][0][0]
-    raise AssertionError(f"{path} has no {component} of {entity}")
+            found += [row[0] for row in columns[component]]
+    assert found, f"{path} has no {component} of {entity}"
+    return found

@@ -26,7 +26,7 @@ from hdril.evaluation.suite_table import tabulate_suite
 from hdril.tasks import TASKS, get_task
 from hdril.tasks.scenario import Scenario
 from hdril.trace import Trace, trace_episode
-from tests.evaluation.checkpoints import experts_episode, listing, save_replay
+from tests.evaluation.checkpoints import experts_episode, listing, save_hdril, save_replay
 from tests.evaluation.synthetic import outcome
 
 SEED = 930_000
@@ -331,10 +331,11 @@ def test_a_suite_that_fails_at_once_leaves_nothing(
 
 
 @pytest.mark.portable
-def test_rows_do_not_depend_on_workers(expert: Trace, cache: None, tmp_path: Path) -> None:
-    policy = save_replay(tmp_path / "p", expert.action)
+def test_rows_do_not_depend_on_workers(dataset: Path, cache: None, tmp_path: Path) -> None:
+    """One pool plays all cells, one after the other."""
+    policy = save_hdril(tmp_path / "p", dataset)
     for workers in (1, 2):
-        eval_command(config_of(policy, tmp_path / f"eval{workers}", workers=workers))
+        eval_command(config_of(policy, tmp_path / f"eval{workers}", workers=workers, cells="yaw"))
     one, two = (json.loads((tmp_path / f"eval{workers}/suite.json").read_text()) for workers in (1, 2))
     assert one == two
 

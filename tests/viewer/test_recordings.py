@@ -18,7 +18,7 @@ from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.primitives import Noise
 from hdril.trace import Trace, trace_episode
 from hdril.viewer.recordings import recording_name, write_recording
-from tests.evaluation.rerun_text import read_back, states, value_of
+from tests.evaluation.rerun_text import read_back, states, value_of, values_of
 
 SUCCEEDED = Ending(True, "", 70)
 IDENTITY = Identity(
@@ -78,3 +78,20 @@ def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path:
     assert json.loads(value_of(path, "/__properties/policy", "identity")) == IDENTITY.as_dict()
     assert not states(text, "/primitive/executed") & {"lift"}
     assert states(text, "/primitive/scripted") == set(env.task_spec.labels)
+
+
+def test_events_are_named_and_bodies_that_move_are_drawn_where_they_were(played, tmp_path: Path) -> None:
+    env, trace, outcome = played
+    disturbed = replace(outcome, events=((12, "platform_slide: platform (0.05 m)"),))
+    slid = trace.poses["platform"].copy()
+    slid[13:, 0] += 0.05
+    moved = replace(trace, poses=trace.poses | {"platform": slid})
+    path = write_recording(
+        tmp_path, EvaluatedEpisode(env, disturbed, moved, Reference.of(env.task_spec, moved, SUCCEEDED))
+    )
+    assert "platform_slide: platform (0.05 m)" in values_of(path, "/log", "TextLog:text")
+    assert "**platform_slide: platform (0.05 m) at 1.2 s.**" in value_of(path, "/summary", "TextDocument:text")
+    drawn = values_of(path, "/world/platform", "Transform3D:translation")
+    assert len(drawn) == len(trace.state)
+    assert drawn[-1][0] - drawn[0][0] == pytest.approx(0.05, abs=1e-6)
+    assert len(values_of(path, "/world/bench", "Transform3D:translation")) == 1, "it does not move"
