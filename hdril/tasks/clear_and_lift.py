@@ -30,8 +30,10 @@ from hdril.tasks.task import Task, Uniform, Values
 
 EDGE, BODY = 0.10, 0.24
 """Width and height of the canister without its post. The board of a table that stands on the platform is 24 cm over it."""
-POST, HEIGHT, GRIP_HEIGHT = 0.025, 0.35, 0.31
-"""The post on top is as thick as the table's handles, and square: it can be taken from any of four headings."""
+POST, HEIGHT, GRIP_HEIGHT = 0.03, 0.35, 0.31
+"""The post on top is thinner than the jaws are wide, and square: it can be taken from any of four headings."""
+PAD = 0.015
+"""The middle of the fingers' pads is so far behind the tool's origin, m."""
 MASS = 0.35
 ASIDE = (0.50, 0.82)
 """Where the canister is put, x and |y|, m."""
@@ -75,7 +77,9 @@ _YAW = math.radians(15.0)
 _ASIDE_X, _ASIDE_Y = (0.45, 0.60), (0.80, 0.88)
 _ON_PLATFORM_X = (PLATFORM_X - PLATFORM_DEPTH / 2 + 0.055, PLATFORM_X - PLATFORM_DEPTH / 2 + 0.13)
 _ON_PLATFORM_Y = (0.05, 0.38)
-_ON_TABLE_X, _ON_TABLE_Y = (-0.06, 0.08), 0.25
+_ON_TABLE_X, _ON_TABLE_Y = (0.0, 0.10), 0.25
+_NEAREST = 0.57
+"""On the table the canister stands no nearer, x, m: a hand that is near and high cannot point down."""
 _TABLE_X, _TABLE_Y = (0.50, 0.60), (-0.20, 0.20)
 
 
@@ -119,13 +123,20 @@ def _on_platform(box: Pose, platform: Pose, table: Pose, values: Values) -> NDAr
 
 
 def _on_table(box: Pose, table: Pose, values: Values) -> NDArray[np.float64]:
-    """On the table as it stands: within 25 cm of the robot's middle, and at least 13 cm before the table's ends."""
-    rotation, (x, y, _) = table.rotation_matrix(), table.position
-    room = (WIDTH / 2 - 0.14) * values.get("size:length", 1.0) * rotation[1, 1]
+    """On the table as it stands: within 25 cm of the robot's middle, and at least 14 cm before the table's ends."""
+    (x, y, _), (cosine, sine) = table.position, table.rotation_matrix()[:2, 0]
+    depth, slope = values.get("size:depth", 1.0) / cosine, sine / cosine
+    room = (WIDTH / 2 - 0.14) * values.get("size:length", 1.0) * cosine
     low, high = max(-_ON_TABLE_Y, y - room), min(_ON_TABLE_Y, y + room)
+    # Where the table is turned, one end of it is too near.
+    if slope > 0.0:
+        high = min(high, y + (x + _ON_TABLE_X[1] * depth - _NEAREST) / slope)
+    elif slope < 0.0:
+        low = max(low, y + (x + _ON_TABLE_X[1] * depth - _NEAREST) / slope)
     across = low + (box.position[1] + _ON_TABLE_Y) / (2.0 * _ON_TABLE_Y) * (high - low)
-    along = box.position[0] * values.get("size:depth", 1.0)
-    return (table @ Pose((along, (across - y - along * rotation[1, 0]) / rotation[1, 1], TOP))).position
+    front, rear = (x - (across - y) * slope + edge * depth for edge in _ON_TABLE_X)
+    front, fraction = max(front, _NEAREST), box.position[0] / _ON_TABLE_X[1]
+    return np.array((front + fraction * (rear - front), across, TOP))
 
 
 def _arrange(values: Values, poses: dict[str, Pose]) -> dict[str, Pose]:
@@ -163,7 +174,7 @@ def holds_box(scene: Scene, side: str) -> bool:
     """Whether a hand was told to close, is not empty, and has the post between its fingers."""
     hand = scene.measured[side]
     near = np.linalg.norm(hand.pose.position - _grip_point(scene.objects["box"])) < 0.04
-    return bool(scene.hands[side].opening < 0.5 and hand.opening > 0.2 and near)
+    return bool(scene.hands[side].opening < 0.5 and hand.opening > 0.08 and near)
 
 
 def concerns(scene: Scene, side: str) -> bool:
@@ -194,11 +205,11 @@ def _grip(scene: Scene) -> Pose:
     point, axes = _grip_point(box), box.rotation_matrix()
     if axes[2, 2] > 0.7:
         heading = math.remainder(math.atan2(axes[1, 0], axes[0, 0]), math.pi / 2)
-        pitch = math.radians(float(np.interp(point[0], (0.60, 0.85), (75.0, 45.0))))
+        pitch = math.radians(float(np.interp(point[0], (0.60, 0.85), (65.0, 45.0))))
     else:  # lying: from above, jaws across the post
         heading = math.remainder(math.atan2(axes[1, 2], axes[0, 2]), math.pi)
         pitch = math.radians(80.0)
-    return Pose(point, _tool(pitch, heading).as_quat())
+    return Pose(point, _tool(pitch, heading).as_quat()) @ Pose((0.0, 0.0, PAD))
 
 
 def _at_post(side: str, opening: float, back_off: float = 0.0) -> Callable[[Scene], Hands]:
@@ -245,10 +256,10 @@ def pick(side: str) -> Primitive:
     return Primitive(
         f"pick_{side}",
         (
-            Segment(6, _at_post(side, 1.0, back_off=0.10), follows=box),
+            Segment(12, _at_post(side, 1.0, back_off=0.10), follows=box),
             Segment(4, _at_post(side, 1.0), jitter=0.25, follows=box),
             Segment(2, _at_post(side, 0.0), jitter=0.0),
-            Segment(6, _lifted(side), jitter=0.5),
+            Segment(8, _lifted(side), jitter=0.5),
         ),
     ).needing(unless=Need(f"not for the {side} hand", lambda scene: aside(scene) or not concerns(scene, side)))
 
@@ -258,11 +269,11 @@ def put(side: str) -> Primitive:
     return Primitive(
         f"put_{side}",
         (
-            Segment(10, _carried(side, TRANSIT, 0.0), jitter=0.5),
-            Segment(6, _carried(side, 0.002, 0.0), jitter=0.5),
+            Segment(14, _carried(side, TRANSIT, 0.0), jitter=0.5),
+            Segment(12, _carried(side, 0.002, 0.0), jitter=0.5),
             Segment(2, _carried(side, 0.002, 1.0), jitter=0.0),
-            Segment(3, _carried(side, 0.002, 1.0, back_off=0.12), jitter=0.25),
-            Segment(5, _home(side)),
+            Segment(4, _carried(side, 0.002, 1.0, back_off=0.12), jitter=0.25),
+            Segment(7, _home(side)),
         ),
     ).needing(
         Need(f"{side} hand holds box", lambda scene: holds_box(scene, side) or aside(scene)),
