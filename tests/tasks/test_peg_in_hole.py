@@ -12,8 +12,8 @@ from hdril.env import BimanualEnv
 from hdril.geometry import Pose
 from hdril.tasks import get_task, peg_in_hole
 from hdril.tasks.expert import ScriptedExpert
-from hdril.tasks.peg_in_hole import LEFT, RIGHT, gap, insertion, make_task
-from hdril.tasks.primitives import Grip, Noise, Primitive, carry_each, lift_joined, lower, reach
+from hdril.tasks.peg_in_hole import LEFT, RIGHT, SIGN, gap, insertion, make_task
+from hdril.tasks.primitives import Noise, Primitive, carry_each, lift_joined, lower, reach
 
 TASK = get_task("peg_in_hole")
 
@@ -39,11 +39,8 @@ def play(seed: int, script: tuple[Primitive, ...], name: str = TASK.name) -> tup
 @pytest.mark.parametrize("handle", [1.0, -1.0], ids=["outer", "inner"])
 def test_unconnected_halves_cannot_be_lifted_level(handle: float) -> None:
     """Each hand lifts the half on its side by one of its handles, where it stands."""
-    outer = peg_in_hole._grips(LEFT, RIGHT)
-    grips = {
-        side: Grip(grip.body, Pose(grip.pose.position * (1.0, handle, 1.0), grip.pose.quaternion))
-        for side, grip in outer.items()
-    }
+    held = {"left": LEFT, "right": RIGHT}
+    grips = {side: peg_in_hole._grip(half, side, handle * SIGN[half]) for side, half in held.items()}
     for seed in range(950_000, 950_020):
         info, _, poses = play(seed, (reach("reach", grips), lower("grasp", grips), lift_joined("lift", squeeze=0.0)))
         assert not info["is_success"]
@@ -55,9 +52,10 @@ def test_unconnected_halves_cannot_be_lifted_level(handle: float) -> None:
 
 def test_a_peg_that_is_half_inserted_fails() -> None:
     held = {"left": LEFT, "right": RIGHT}
-    stop = carry_each("connect", held, peg_in_hole._apart(peg_in_hole.WIDTH / 2 + 0.02, LEFT, RIGHT), 10)
+    wide = peg_in_hole._apart(lambda scene, half: SIGN[half] * (peg_in_hole.WIDTH / 2 + 0.02), LEFT, RIGHT)
+    stop = carry_each("connect", held, wide, 10)
     for seed in range(951_000, 951_003):
-        info, infos, _ = play(seed, (*TASK.primitives[:-2], stop, TASK.primitives[-1]))
+        info, infos, _ = play(seed, (*TASK.primitives[:-2], stop, lift_joined(frames=10)))
         assert not info["is_success"]
         assert "gap" in info["unmet"]
         assert info["stage"] == [stage.name for stage in TASK.stages].index("peg in the hole") + 1
