@@ -97,12 +97,13 @@ def show_dataset(root: Path, episode: int, path: Path) -> tuple[Path, str]:
 
 
 def _own(provenance: Provenance, episode: int, stored: StoredEpisode, path: Path) -> tuple[Path, str]:
-    seed = provenance.seeds[episode]
-    actions = ReplayActor(stored.action)
-    env = provenance.recipe.make_env()
+    seed, recipe = provenance.seeds[episode], provenance.recipe
+    # A robot that was disturbed was not told the actions that are recorded: the expert plays again, with the same noise.
+    actor = recipe.make_expert() if recipe.perturb else ReplayActor(stored.action)
+    env = recipe.make_env()
     with closing(env):
-        reference = ReferenceCache(provenance.recipe.task).get(seed)
-        trace, ending = trace_episode(env, actions, seed, stored.label)
+        reference = ReferenceCache(recipe.task).get(seed)
+        trace, ending = trace_episode(env, actor, seed, stored.label)
         outcome = score_episode(env.task_spec, seed, trace, reference, ending)
         name = f"episode_{episode:06d}_{recording_name(outcome)}"
         write_episodes(path, name, {"": EvaluatedEpisode(env, outcome, trace, reference)})

@@ -16,9 +16,11 @@ from safetensors.torch import load_file
 
 from hdril.cli.eval import EvalConfig, PolicySource, eval_command
 from hdril.cli.view import ViewConfig, view_command
+from hdril.demonstrations.provenance import Recipe
+from hdril.demonstrations.record import record
 from hdril.tasks import get_task
 from tests.evaluation.checkpoints import experts_episode, save_hdril, save_replay
-from tests.evaluation.rerun_text import read_back, states
+from tests.evaluation.rerun_text import read_back, states, values_of
 
 SEED = 200_002
 
@@ -159,6 +161,17 @@ def test_episode_of_a_dataset_is_played_again_with_its_labels(dataset: Path, tmp
     for entity in ("/primitive/scripted", "/robot/joints/left_s0", "/world/table", "/grip_force_N/left"):
         assert f"entity_path: {entity} " in text
     assert states(text, "/primitive/scripted") == {"grasp", "move", "lift", "extend", "place", "retract"}
+
+
+def test_episode_of_a_disturbed_robot_is_played_again_with_its_event(tmp_path: Path, capsys) -> None:
+    """The recorded actions are not what the robot was told, and the table was pushed."""
+    task = "table_lift:push=1"
+    provenance = record(Recipe(task, perturb=0.003), 1, 930_000, tmp_path / "dataset")
+    view_command(ViewConfig(dataset=tmp_path / "dataset", save=tmp_path / "episode.rrd"))
+    (seed,) = provenance.seeds
+    assert f"seed {seed}, played again: its states are 0 m or less from the recorded ones" in capsys.readouterr().out
+    (event,) = get_task(task).sample(seed).events
+    assert str(event) in values_of(tmp_path / "episode.rrd", "/log", "TextLog:text")
 
 
 def test_dataset_that_hdril_did_not_record(dataset: Path, tmp_path: Path) -> None:
