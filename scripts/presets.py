@@ -18,7 +18,7 @@ from typing import Any
 
 from lerobot_policy_hdril import HDRILConfig
 from lerobot_policy_hdril.presets import PRESETS
-from pairs import paired_p_value
+from pairs import paired_p_value, summary
 from stages import Stage, checkpoint, commit, evaluation_stage, record_stage, run_chains, train_stage
 
 from hdril.evaluation.statistics import holm
@@ -154,12 +154,6 @@ def finished(document: Path, settings: dict[str, Any]) -> dict[str, Any]:
     return results["presets"]
 
 
-def _summary(results: dict[str, Any]) -> dict[str, Any]:
-    """What is kept of ``results.json``. ``failed_seeds`` lets the report pair two presets seed by seed."""
-    kept = {key: value for key, value in results.items() if key not in ("per_episode", "policy", "comparison")}
-    return kept | {"failed_seeds": [episode["seed"] for episode in results["per_episode"] if not episode["success"]]}
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", default="table_lift")
@@ -203,7 +197,7 @@ def main() -> None:
         row: dict[str, Any] = {"commit": commit(), "parameters": parameters(preset, dataset)}
         for rollout in ROLLOUTS:
             summary = json.loads((options.output / preset / rollout / "results.json").read_text())
-            row[rollout] = _summary(summary)
+            row[rollout] = summary(summary)
         known[preset] = row
     results = settings | {"presets": {preset: known[preset] for preset in PRESETS if preset in known}}
     options.document.parent.mkdir(parents=True, exist_ok=True)
