@@ -23,7 +23,7 @@ class PValue:
         return f"p {'=' if self.exact else '≤'} {adjusted:.2g}"
 
 
-def summary(results: Mapping[str, Any]) -> dict[str, Any]:
+def summarise(results: Mapping[str, Any]) -> dict[str, Any]:
     """What a document keeps of ``results.json``. ``failed_seeds`` lets the report pair two policies seed by seed."""
     kept = {key: value for key, value in results.items() if key not in ("per_episode", "policy", "comparison")}
     return kept | {"failed_seeds": [episode["seed"] for episode in results["per_episode"] if not episode["success"]]}

@@ -18,7 +18,7 @@ from typing import Any
 
 from lerobot_policy_hdril import HDRILConfig
 from lerobot_policy_hdril.presets import PRESETS
-from pairs import paired_p_value, summary
+from pairs import paired_p_value, summarise
 from stages import Stage, checkpoint, commit, evaluation_stage, record_stage, run_chains, train_stage
 
 from hdril.evaluation.statistics import holm
@@ -197,7 +197,7 @@ def main() -> None:
         row: dict[str, Any] = {"commit": commit(), "parameters": parameters(preset, dataset)}
         for rollout in ROLLOUTS:
             summary = json.loads((options.output / preset / rollout / "results.json").read_text())
-            row[rollout] = summary(summary)
+            row[rollout] = summarise(summary)
         known[preset] = row
     results = settings | {"presets": {preset: known[preset] for preset in PRESETS if preset in known}}
     options.document.parent.mkdir(parents=True, exist_ok=True)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from damage import leave_linear_maps
-from pairs import paired_p_value, summary
+from pairs import paired_p_value, summarise
 from stages import Stage, checkpoint, commit, evaluation_stage, record_stage, run_chains, train_stage
 
 from hdril.evaluation.statistics import holm
@@ -75,7 +75,8 @@ def markdown(results: dict[str, Any]) -> str:
         f"{results['batch_size']}, {results['episodes']} held-out seeds from {results['seed']} on. Made by "
         "`python scripts/separation.py`. Success in percent with the 95 % interval (Wilson). The linear maps are those of "
         "`hdril`, with networks that predict nothing. Each model was trained once: an interval says how often this trained "
-        "policy succeeds, and not what another training gives. p is of McNemar's exact test against `hdril`, adjusted by Holm's method.",
+        "policy succeeds, and not what another training gives. p is of McNemar's exact test against `hdril`, adjusted by "
+        "Holm's method.",
     ]
     for task, entry in results["tasks"].items():
         rows, base = entry["rows"], entry["rows"]["hdril"]
@@ -121,7 +122,7 @@ def main() -> None:
         run_chains(training(task, options), options.jobs)
         stages = {name: evaluation(task, name, policy, options) for name, policy in policies(task, options).items()}
         run_chains([[stage] for stage in stages.values()], options.jobs)
-        rows = {name: summary(json.loads(stage.result.read_text())) for name, stage in stages.items()}
+        rows = {name: summarise(json.loads(stage.result.read_text())) for name, stage in stages.items()}
         results["tasks"][task] = {"commit": commit(), "rows": rows}
         write_atomically(data, lambda file: file.write(json.dumps(results, indent=1).encode()))
         options.document.with_suffix(".md").write_text(markdown(results))

@@ -278,7 +278,7 @@ def test_failed_seeds_are_kept_for_pairs(tmp_path: Path) -> None:
         "per_episode": [{"seed": 7, "success": False}, {"seed": 8, "success": True}],
     }  # fmt: skip
     (tmp_path / "results.json").write_text(json.dumps(results))
-    for kept in (presets._summary(results), learning._summary(tmp_path)):
+    for kept in (pairs.summarise(results), learning._summary(tmp_path)):
         assert kept["failed_seeds"] == [7]
         assert "per_episode" not in kept
         assert "policy" not in kept
