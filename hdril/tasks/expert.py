@@ -62,6 +62,7 @@ class ScriptedExpert:
             events = self._watch(self._plan, scene)
         if self._plan is None or self._plan.over:
             primitive, reason = self._choose(scene)
+            scene = _as_measured(scene) if reason else scene
             self._plan, self._missing, starts = Plan(primitive, scene, self.noise, self._rng), 0, True
             events = (*events, *reason)
         action = self._last = self._plan.next()
@@ -121,3 +122,18 @@ class ScriptedExpert:
             measured,
             dict(self.task.attributes) | dict(zip([n for n, _ in task.attributes], values[poses.size :], strict=False)),
         )
+
+
+ASTRAY = 0.03
+"""A hand that is further than this, m, from where it was told to be has been hindered."""
+
+
+def _as_measured(scene: Scene) -> Scene:
+    """The scene, in which a hand that is not where it was told to be was told to be where it is."""
+    hands = {
+        side: replace(hand, pose=scene.measured[side].pose)
+        if np.linalg.norm(hand.pose.position - scene.measured[side].pose.position) > ASTRAY
+        else hand
+        for side, hand in scene.hands.items()
+    }
+    return replace(scene, hands=hands)

@@ -258,19 +258,21 @@ def _bodies(grips: Grips) -> tuple[str, ...]:
 # ---------------------------------------------------------------------- needs
 
 
-def holding(grips: Grips, tolerance: float = 0.03, thinnest: float = 0.1) -> Need:
-    """Each hand holds what it grips: it was told to close, it is within ``tolerance`` m of its grip, and it is not empty.
+def holds_grip(scene: Scene, side: str, grip: Grip, tolerance: float = 0.03, thinnest: float = 0.1) -> bool:
+    """Whether a hand holds what it grips: it was told to close, it is within ``tolerance`` m of its grip, and it is not empty.
 
     A hand that closes on nothing is open by less than ``thinnest`` (0 to 1).
     """
+    hand = scene.measured[side]
+    near = np.linalg.norm(hand.pose.position - grip.tool(scene).position) < tolerance
+    return bool(scene.hands[side].opening < 0.5 and hand.opening > thinnest and near)
+
+
+def holding(grips: Grips, tolerance: float = 0.03, thinnest: float = 0.1) -> Need:
+    """Each hand holds what it grips: :func:`holds_grip`."""
 
     def holds(scene: Scene) -> bool:
-        return all(
-            scene.hands[side].opening < 0.5
-            and scene.measured[side].opening > thinnest
-            and np.linalg.norm(scene.measured[side].pose.position - grip.tool(scene).position) < tolerance
-            for side, grip in grips.items()
-        )
+        return all(holds_grip(scene, side, grip, tolerance, thinnest) for side, grip in grips.items())
 
     return Need(f"both hands hold {', '.join(_bodies(grips))}", holds)
 
@@ -310,6 +312,19 @@ def hands_at(opening: float, back_off: float = 0.0, rise: float = 0.0) -> Callab
         }
 
     return goal
+
+
+def keeping(primitive: Primitive, keeps: Callable[[Scene, str], bool]) -> Primitive:
+    """The primitive, but a hand (scene, side) that ``keeps`` what it holds stays as it was told to be."""
+
+    def kept(segment: Segment) -> Segment:
+        def goal(scene: Scene) -> Hands:
+            goals = segment.goal(scene)
+            return {side: scene.hands[side] if keeps(scene, side) else hand for side, hand in goals.items()}
+
+        return replace(segment, goal=goal)
+
+    return replace(primitive, segments=tuple(kept(segment) for segment in primitive.segments))
 
 
 # ---------------------------------------------------------------------- constructors

@@ -30,6 +30,8 @@ from hdril.tasks.primitives import (
     extend,
     grasp,
     holding,
+    holds_grip,
+    keeping,
     lift,
     move,
     place,
@@ -168,20 +170,28 @@ def before_platform(scene: Scene) -> float:
     return min(MOVED_X, front - legs - 0.05)
 
 
+def _spare_x(scene: Scene) -> float:
+    """How far the table may stand from the platform's middle, m, with the middles of its legs 5 mm from the edge."""
+    return PLATFORM_DEPTH / 2 - LEG_X * scene.attributes["table.depth"] / DEPTH - 0.005
+
+
+def _spare_y(scene: Scene) -> float:
+    return PLATFORM_WIDTH / 2 - LEG_Y * scene.attributes["table.length"] / WIDTH - 0.005
+
+
 def goal_x(scene: Scene) -> float:
     """Where the table goes on the platform, x, m: its middle, or nearer to the robot if the platform is far away.
 
     The middles of the front legs stay on the platform, 5 mm from its edge or more.
     """
     x = float(scene.objects["platform"].position[0])
-    spare = PLATFORM_DEPTH / 2 - LEG_X * scene.attributes["table.depth"] / DEPTH - 0.005
-    return x - min(max(x - PLATFORM_X, 0.0), spare)
+    return x - min(max(x - PLATFORM_X, 0.0), _spare_x(scene))
 
 
 def goal_y(scene: Scene) -> float:
     """Where the table goes on the platform, y, m: in front of the robot, or as near to that as the legs allow."""
     y = float(scene.objects["platform"].position[1])
-    spare = PLATFORM_WIDTH / 2 - LEG_Y * scene.attributes["table.length"] / WIDTH - 0.005
+    spare = _spare_y(scene)
     return y - min(max(y, -spare), spare)
 
 
@@ -217,14 +227,22 @@ def _raised(scene: Scene) -> bool:
 
 
 def _over_platform(scene: Scene) -> bool:
-    x, y, _ = scene.objects["table"].position
-    return _raised(scene) and math.hypot(x - goal_x(scene), y - goal_y(scene)) < 0.05
+    """Whether the middles of the legs are over the platform, or not more than 12 mm beside it."""
+    x, y, _ = (scene.objects["platform"].inverse() @ scene.objects["table"]).position
+    return bool(abs(x) < _spare_x(scene) + 0.017 and abs(y) < _spare_y(scene) + 0.017)
 
 
 RAISED = Need("table raised", _raised)
 OVER_PLATFORM = Need("table over the platform", _over_platform)
 ON_BENCH = stands_at("table", 0.0)
+OFF_BENCH = Need("table off the bench", lambda scene: not ON_BENCH.holds(scene))
 ON_PLATFORM = stands_at("table", height_of_platform, tolerance=0.015)
+
+
+def _keeps(scene: Scene, side: str) -> bool:
+    """Whether the table would fall if this hand opened."""
+    stands = ON_BENCH.holds(scene) or (ON_PLATFORM.holds(scene) and OVER_PLATFORM.holds(scene))
+    return not stands and holds_grip(scene, side, GRIPS[side])
 
 
 def make_scene(values: Values) -> Task:
@@ -244,14 +262,14 @@ def make_scene(values: Values) -> Task:
         also_observed=("platform",),
         attributes=(("table.length", WIDTH * length), ("table.depth", DEPTH * depth), ("platform.height", height)),
         primitives=(
-            grasp(GRIPS),
-            _levelling(move("table", x=before_platform, y=0.0)).needing(HELD, ON_BENCH),
+            keeping(grasp(GRIPS), _keeps),
+            _levelling(move("table", x=before_platform, y=0.0)).needing(HELD, ON_BENCH, unless=OFF_BENCH),
             lift("table", lambda scene: height_of_platform(scene) + 0.06).needing(HELD),
             extend("table", x=goal_x, y=goal_y, follows=("platform",)).needing(HELD, RAISED),
-            place("table", height_of_platform).needing(HELD),
-            retract().needing(ON_PLATFORM),
+            place("table", height_of_platform).needing(HELD, OVER_PLATFORM),
+            retract().needing(ON_PLATFORM, OVER_PLATFORM),
         ),
-        recovery=(retract(),),
+        recovery=(keeping(retract(), _keeps),),
         success=(
             upright("table"),
             at_height("table", height),
