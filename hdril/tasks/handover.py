@@ -7,7 +7,7 @@ cannot reach the bar where it lies. A planner has to see which hand picks; a wro
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -45,8 +45,8 @@ BAR_X, BAR_Y = (0.46, 0.56), (0.56, 0.64)
 RACK_X, RACK_Y = (0.48, 0.54), (0.54, 0.60)
 YAW = math.radians(15.0)
 REST = {
-    False: Rest(upright=False, tolerance=(0.03, 0.012), above=0.12, frames=(12, 7)),
-    True: Rest(upright=True, tolerance=(0.015, 0.015), above=0.13, frames=(22, 9)),
+    False: Rest(upright=False, tolerance=(0.03, 0.012), above=0.12, frames=(12, 7, 8)),
+    True: Rest(upright=True, tolerance=(0.015, 0.015), above=0.15, frames=(22, 13, 12)),
 }
 """Flat, and upright."""
 
@@ -131,17 +131,31 @@ def _cradle(height: float) -> BodySpec:
 
 
 def _socket(height: float) -> BodySpec:
-    """A block with four walls on it; the bar stands between them."""
-    inner, wall = THICKNESS + 2 * 0.005, 0.02
-    middle = (inner + wall) / 2
-    return BodySpec(
-        "rack",
-        (
-            Box((0.12, 0.12, height), (0.0, 0.0, height / 2), STEEL),
-            *(Box((wall, inner + 2 * wall, WALL), (a * middle, 0.0, height + WALL / 2), STEEL) for a in (-1.0, 1.0)),
-            *(Box((inner, wall, WALL), (0.0, b * middle, height + WALL / 2), STEEL) for b in (-1.0, 1.0)),
-        ),
-    )
+    """A block with four walls on it, and a plate on each that leads the bar in; the bar stands between them."""
+    inner, wall = THICKNESS + 2 * 0.006, 0.02
+    boxes = [Box((0.12, 0.12, height), (0.0, 0.0, height / 2), STEEL)]
+    for quarter in range(4):
+        x, z = (inner + wall) / 2, height + WALL / 2
+        boxes.append(_turned(Box((wall, inner + 2 * wall, WALL), (x, 0.0, z), STEEL), quarter))
+        boxes.append(_turned(_lead_in(inner / 2, height + WALL, inner), quarter))
+    return BodySpec("rack", tuple(boxes))
+
+
+def _lead_in(x: float, z: float, width: float) -> Box:
+    """A plate whose inner surface rises from (x, z) outwards, 30 degrees off vertical."""
+    tilt, length, thickness = math.radians(30.0), 0.03, 0.006
+    quaternion = (0.0, math.sin(tilt / 2), 0.0, math.cos(tilt / 2))
+    middle = Pose((x, 0.0, z), quaternion) @ Pose((thickness / 2, 0.0, length / 2))
+    a, b, c = middle.position.tolist()
+    return Box((thickness, width, length), (a, b, c), STEEL, quaternion)
+
+
+def _turned(box: Box, quarter: int) -> Box:
+    """The box, turned by quarters of a turn about the rack's z axis."""
+    half = quarter * math.pi / 4
+    pose = Pose((0.0, 0.0, 0.0), (0.0, 0.0, math.sin(half), math.cos(half))) @ Pose(box.centre, box.quaternion)
+    (x, y, z), (a, b, c, d) = pose.position.tolist(), pose.quaternion.tolist()
+    return replace(box, centre=(x, y, z), quaternion=(a, b, c, d))
 
 
 # ---------------------------------------------------------------------- success
@@ -160,7 +174,7 @@ def _passed(world: World) -> bool:
 def _script(rest: Rest) -> tuple[Primitive, ...]:
     """For each step the primitive of either hand; one of the two is passed over."""
     steps = (partial(pick, rest=rest), bring, take, release, partial(carry, rest=rest), partial(insert, rest=rest))
-    last = retract("retract").needing(Need("bar in the rack", lambda scene: in_rack(scene, rest)))
+    last = retract("retract", rest.frames[2]).needing(Need("bar in the rack", lambda scene: in_rack(scene, rest)))
     return (*(step(side) for step in steps for side in SIDES), last)
 
 

@@ -50,16 +50,16 @@ class Rest:
     """How far the bar's middle may be off, along the rack's x and y, m."""
     above: float
     """How high the bar is brought over the rack before it is lowered, m."""
-    frames: tuple[int, int]
-    """Of ``carry`` and ``insert``."""
+    frames: tuple[int, int, int]
+    """Of ``carry``, ``insert`` and ``retract``."""
 
     def middle(self, attributes: dict[str, float]) -> float:
         """Height of the middle of a bar that rests in the rack over the rack's foot, m."""
         return attributes["rack.height"] + 0.5 * (attributes["bar.length"] if self.upright else THICKNESS)
 
-    def aligned(self, bar: Pose) -> bool:
-        """Whether the bar is within 8 degrees of the direction in which it rests."""
-        return abs(float(along(bar)[2 if self.upright else 0])) > 0.99
+    def aligned(self, bar: Pose, least: float = 0.99) -> bool:
+        """Whether the bar is within arccos(``least``) of the direction in which it rests."""
+        return abs(float(along(bar)[2 if self.upright else 0])) > least
 
     def reached(self, bar: Pose, rack: Pose, height: float) -> bool:
         """Whether the bar rests in the rack, where its middle is ``height`` m over the rack's foot."""
@@ -67,9 +67,9 @@ class Rest:
         return bool(x < self.tolerance[0] and y < self.tolerance[1] and z < 0.01 and self.aligned(bar))
 
     def over(self, scene: Scene) -> bool:
-        """Whether the bar is over the rack, so that it can be lowered."""
+        """Whether the bar is over the rack, so that it can be squared and lowered."""
         offset = np.abs(scene.objects["bar"].position - scene.objects["rack"].position)
-        return bool((offset[:2] < 0.04).all() and self.aligned(scene.objects["bar"]))
+        return bool((offset[:2] < 0.04).all() and self.aligned(scene.objects["bar"], 0.9 if self.upright else 0.98))
 
 
 def in_rack(scene: Scene, rest: Rest) -> bool:
@@ -325,10 +325,14 @@ def carry(side: str, rest: Rest) -> Primitive:
 
 
 def insert(side: str, rest: Rest) -> Primitive:
-    """Lower the bar into the rack."""
+    """Lower the bar into the rack; one that will stand is first squared, because it turns in the fingers as it is raised."""
+    square = 4 if rest.upright else 0
     return Primitive(
         f"insert_{side}",
-        (Segment(rest.frames[1], _to_rack(side, rest, 0.0), jitter=0.25, follows=("rack",)),),
+        (
+            *((Segment(square, _to_rack(side, rest, rest.above), jitter=0.25, follows=("rack",)),) if square else ()),
+            Segment(rest.frames[1] - square, _to_rack(side, rest, 0.0), jitter=0.25, follows=("rack",)),
+        ),
         needs=(_held(side), Need("bar over the rack", rest.over)),
         unless=Need("not the receiver, or the bar in the rack", lambda s: receiver(s) != side or in_rack(s, rest)),
     )
