@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdril.geometry import Pose
+from hdril.geometry import Pose, geodesic_distance
 from hdril.simulation.actions import HandCommand
 from hdril.simulation.bodies import BodySpec, Box
 from hdril.simulation.robots.spec import SIDES
@@ -320,7 +321,7 @@ HIGH = Need(
         hand.pose.position[2] > GRIP_HEIGHT + 0.05 and hand.opening > 0.8 for hand in scene.measured.values()
     ),
 )
-HIGH_ENOUGH = Need(
+OVER_ALL = Need(
     "hands over all handles",
     lambda scene: all(hand.pose.position[2] > GRIP_HEIGHT + 0.04 for hand in scene.measured.values()),
 )
@@ -335,6 +336,25 @@ def _over(grips: Grips) -> Need:
         return all(math.hypot(x, y) < 0.05 + 1.5 * max(z, 0.0) and z > -0.03 for x, y, z in offsets)
 
     return Need("hands over the handles", holds)
+
+
+def _firm(grips: Grips) -> Need:
+    """Each hand is where it was told to be, and stands to its handle as it was put there.
+
+    A hand that is not has slipped or pulls in vain: it must let go and take hold again, because the targets that follow from
+    its last command would only move further away.
+    """
+
+    def holds(scene: Scene) -> bool:
+        for side, grip in grips.items():
+            told, hand, tool = scene.hands[side].pose, scene.measured[side].pose, grip.tool(scene)
+            if math.dist(told.position, hand.position) > 0.02:
+                return False
+            if geodesic_distance(hand.quaternion, tool.quaternion) > math.radians(6.0):
+                return False
+        return True
+
+    return Need("grips firm", holds)
 
 
 # ---------------------------------------------------------------------- script
@@ -377,28 +397,42 @@ def _release(name: str, frames: int) -> Primitive:
     )
 
 
+@dataclass(frozen=True)
+class _FromAbove(Primitive):
+    """A primitive that begins with both hands over all handles: from beside a half they would knock it over."""
+
+    def possible(self, scene: Scene) -> bool:
+        return OVER_ALL.holds(scene) and super().possible(scene)
+
+
+def _from_above(primitive: Primitive, *needs: Need, unless: Need | None = None) -> Primitive:
+    return _FromAbove(primitive.name, primitive.segments, needs, unless)
+
+
 def _phase(half: str, targets: Targets, frames: int, *needs: Need) -> tuple[Primitive, ...]:
-    """Take a half with both hands to where it shall stand, and leave it there."""
-    name, done = half.removesuffix("_half"), _done(half)
+    """Take a half with both hands to where it shall stand, and leave it there. Its first primitive needs ``needs``."""
+    name, done, grips = half.removesuffix("_half"), _done(half), ON[half]
+    first = reach(f"reach_{name}", grips, frames)
+    move = carry_each(f"move_{name}", dict.fromkeys(SIDES, half), targets, frames, 0.5, rigid=True)
     return (
-        reach(f"reach_{name}", ON[half], frames).needing(*needs, unless=done),
-        lower(f"grasp_{name}", ON[half], frames).needing(_over(ON[half]), unless=done),
-        carry_each(f"move_{name}", dict.fromkeys(SIDES, half), targets, frames, 0.5, rigid=True).needing(
-            holding(ON[half]), unless=done
-        ),
+        _from_above(first, *needs, unless=done) if needs else first.needing(unless=done),
+        _from_above(lower(f"grasp_{name}", grips, frames), _over(grips), unless=done),
+        move.needing(holding(grips), unless=done),
         _release(f"retract_{name}", frames),
     )
 
 
 def _primitives(frames: int = 10) -> tuple[Primitive, ...]:
-    held = holding(ON_BOTH)
+    held, firm = holding(ON_BOTH), _firm(ON_BOTH)
     return (
         *_phase(LEFT, _apart(_aligned_y, LEFT), frames),
-        *_phase(RIGHT, _opposite, frames, LEFT_READY, HIGH_ENOUGH),
-        reach("reach_both", ON_BOTH, frames).needing(HIGH_ENOUGH, BOTH_READY),
-        lower("grasp_both", ON_BOTH, frames).needing(_over(ON_BOTH), BOTH_READY),
-        carry_each("align", HELD, _apart(_aligned_y, *HALVES), frames, jitter=0.25).needing(held, unless=INSERTED),
-        carry_each("connect", HELD, _apart(_pressed_y, *HALVES), frames, jitter=0.1).needing(held, OPPOSITE),
+        *_phase(RIGHT, _opposite, frames, LEFT_READY),
+        _from_above(reach("reach_both", ON_BOTH, frames), BOTH_READY),
+        _from_above(lower("grasp_both", ON_BOTH, frames), _over(ON_BOTH), BOTH_READY),
+        carry_each("align", HELD, _apart(_aligned_y, *HALVES), frames, jitter=0.25).needing(
+            held, firm, unless=INSERTED
+        ),
+        carry_each("connect", HELD, _apart(_pressed_y, *HALVES), frames, jitter=0.1).needing(held, firm, OPPOSITE),
         lift_joined("lift", rise=0.12, frames=frames).needing(held, CLOSED),
     )
 

@@ -10,8 +10,11 @@ import pytest
 
 from hdril.env import BimanualEnv
 from hdril.geometry import Pose
+from hdril.rollout import transitions
 from hdril.tasks import get_task, peg_in_hole
+from hdril.tasks.events import Event
 from hdril.tasks.expert import ScriptedExpert
+from hdril.tasks.footprint import apart
 from hdril.tasks.peg_in_hole import LEFT, RIGHT, SIGN, gap, insertion, make_task
 from hdril.tasks.primitives import Noise, Primitive, carry_each, lift_joined, lower, reach
 
@@ -112,3 +115,66 @@ def test_hole_is_wider_than_the_peg_by_the_clearance() -> None:
 def test_parameters_are_checked(name: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         get_task(name)
+
+
+def test_each_half_has_its_own_size_mass_and_heading() -> None:
+    values = {
+        "size:left_half.length": 0.9,
+        "size:right_half.depth": 1.1,
+        "mass:right_half": 2.0,
+        "yaw:left_half": 20.0,
+        "hole": 0.6,
+    }
+    scene, before = TASK.at(values), dict(TASK.attributes)
+    after = dict(scene.attributes)
+    assert after["left_half.length"] == pytest.approx(0.9 * before["left_half.length"])
+    assert after["right_half.depth"] == pytest.approx(1.1 * before["right_half.depth"])
+    assert {name for name in after if after[name] != before[name]} == {"left_half.length", "right_half.depth"}
+    left, right = scene.bodies[1:]
+    assert (left.mass, right.mass) == (2.0, 4.0)
+    assert left.boxes[-1].size == TASK.bodies[1].boxes[-1].size  # the peg does not grow
+    assert scene.placements[LEFT].yaw == pytest.approx(np.deg2rad(20.0))
+    assert scene.placements[RIGHT].yaw == 0.0
+    assert right.boxes == make_task(0.003).at(values | {"hole": 1.0}).bodies[2].boxes
+
+
+@pytest.mark.parametrize("half", [LEFT, RIGHT])
+@pytest.mark.parametrize("scale", [0.85, 1.15])
+def test_gap_and_insertion_know_the_size_of_the_halves(half: str, scale: float) -> None:
+    """The faces touch and the peg is in to its root, for a half of any length."""
+    scene = TASK.at({f"size:{half}.length": scale})
+    lengths = dict(scene.attributes)
+    widths = (lengths["left_half.length"], lengths["right_half.length"])
+    poses = Pose((0.6, widths[0] / 2, 0.0)), Pose((0.6, -widths[1] / 2, 0.0))
+    assert peg_in_hole._between(*poses, widths) == pytest.approx(0.0, abs=1e-9)
+    assert peg_in_hole._depth_of_peg(*poses, widths) == pytest.approx(peg_in_hole.PEG_LENGTH)
+
+
+def test_halves_never_start_inside_each_other() -> None:
+    """Turned by 45 degrees, some placements overlap: they are not drawn."""
+    task = get_task("peg_in_hole:yaw=45,size=0.2")
+    rejected = 0
+    for seed in range(960_000, 960_040):
+        scenario = task.sample(seed)
+        scene = task.at(scenario.values)
+        poses = {half: scenario.pose(half) for half in (LEFT, RIGHT)}
+        assert apart(scene.bodies[1], poses[LEFT], scene.bodies[2], poses[RIGHT], 0.01)
+        near = {half: Pose(pose.position * (1.0, 0.6, 1.0), pose.quaternion) for half, pose in poses.items()}
+        rejected += not task.admissible(near, scenario.values)
+    assert rejected > 20
+
+
+def test_a_half_that_is_pushed_away_is_fetched_again() -> None:
+    """The left half is pushed when it stands ready and the right one is being fetched."""
+    pushed = Event("push", "push", 45, 1, LEFT, (0.0, 1.2, 0.0))
+    env = BimanualEnv("peg_in_hole:push=1")
+    expert = ScriptedExpert(env.task_spec)
+    with closing(env):
+        scenario = replace(env.task_spec.sample(961_000), events=(pushed,))
+        steps = list(transitions(env, expert, 961_000, scenario=scenario))
+    told = [step.decision.explanation for step in steps]
+    labels = [TASK.labels[each.primitive] for each in told if each is not None and each.starts]
+    assert labels[:5] == ["reach_left", "grasp_left", "move_left", "retract_left", "reach_right"]
+    assert labels[5:].count("move_left") == 1
+    assert steps[-1].info["is_success"]
+    assert TASK.horizon < len(steps) < env.task_spec.budget
