@@ -19,31 +19,33 @@ from hdril.geometry import Pose
 from hdril.simulation.actions import HandCommand
 from hdril.simulation.bodies import BodySpec, Box
 from hdril.simulation.robots.spec import SIDES
-from hdril.simulation.world import ROBOT
+from hdril.simulation.world import ROBOT, World
 from hdril.tasks import table_lift
 from hdril.tasks.bench import BENCH
-from hdril.tasks.conditions import Stage, not_touching, raised, touching
+from hdril.tasks.conditions import Condition, Stage, raised
 from hdril.tasks.factors import Factor
 from hdril.tasks.primitives import Hands, Need, Primitive, Scene, Segment
 from hdril.tasks.table_lift import DEPTH, PLATFORM_DEPTH, PLATFORM_HEIGHT, PLATFORM_X, TOP, WIDTH
 from hdril.tasks.task import Task, Uniform, Values
 
-EDGE, BODY = 0.10, 0.24
-"""Width and height of the canister without its post. The board of a table that stands on the platform is 24 cm over it."""
-POST, HEIGHT, GRIP_HEIGHT = 0.03, 0.35, 0.31
+EDGE, FOOT, NECK = 0.12, 0.10, 0.06
+"""Width and height of the canister's foot, and width of its neck. Its weight is low, so that it lands upright if it falls."""
+SHOULDER, POST, HEIGHT, GRIP_HEIGHT = 0.24, 0.03, 0.35, 0.31
 """The post on top is thinner than the jaws are wide, and square: it can be taken from any of four headings."""
 PAD = 0.015
 """The middle of the fingers' pads is so far behind the tool's origin, m."""
 MASS = 0.35
+SHOULDER_Y = 0.26
+"""How far a shoulder is from the robot's middle, m."""
 ASIDE = (0.50, 0.82)
 """Where the canister is put, x and |y|, m."""
 TRANSIT = 0.43
 """Height of the canister's foot, m, when it is carried: over the handles of the table."""
 HOME = (0.56, 0.46, 0.47)
 """Where a hand goes that has put the canister aside: (x, |y|, z), m."""
-CLEARANCE = 0.085
+CLEARANCE = 0.095
 """Least distance, m, of the canister's axis from the table's board if it stands on the platform."""
-FARTHEST = 0.99
+FARTHEST = 0.98
 """The canister stands no further away, x, m: beyond it no hand reaches down to it."""
 
 GREEN, DARK = (0.36, 0.55, 0.40, 1.0), (0.20, 0.30, 0.24, 1.0)
@@ -59,23 +61,21 @@ FACTORS = (
 # ---------------------------------------------------------------------- scene
 
 
+_SHAPE = (
+    Box((EDGE, EDGE, FOOT), (0.0, 0.0, FOOT / 2), GREEN),
+    Box((NECK, NECK, SHOULDER - FOOT), (0.0, 0.0, (FOOT + SHOULDER) / 2), GREEN),
+    Box((POST, POST, HEIGHT - SHOULDER), (0.0, 0.0, (SHOULDER + HEIGHT) / 2), DARK),
+)
+
+
 def _box(values: Values) -> BodySpec:
-    post = HEIGHT - BODY
-    return BodySpec(
-        "box",
-        (
-            Box((EDGE, EDGE, BODY), (0.0, 0.0, BODY / 2), GREEN),
-            Box((POST, POST, post), (0.0, 0.0, BODY + post / 2), DARK),
-        ),
-        mass=MASS * values.get("box_mass", 1.0),
-        # With 0.8 it tips over on a table that is pushed; with 0.5 it slides.
-        friction=0.5,
-    )
+    # With a friction of 0.8 it tips over on a table that is pushed; with 0.5 it slides.
+    return BodySpec("box", _SHAPE, mass=MASS * values.get("box_mass", 1.0), friction=0.5)
 
 
 _YAW = math.radians(15.0)
 _ASIDE_X, _ASIDE_Y = (0.45, 0.60), (0.80, 0.88)
-_ON_PLATFORM_X = (PLATFORM_X - PLATFORM_DEPTH / 2 + 0.055, PLATFORM_X - PLATFORM_DEPTH / 2 + 0.13)
+_ON_PLATFORM_X = (PLATFORM_X - PLATFORM_DEPTH / 2 + 0.05, PLATFORM_X - PLATFORM_DEPTH / 2 + 0.13)
 _ON_PLATFORM_Y = (0.05, 0.38)
 _ON_TABLE_X, _ON_TABLE_Y = (0.0, 0.10), 0.25
 _NEAREST = 0.57
@@ -115,7 +115,8 @@ def _on_platform(box: Pose, platform: Pose, table: Pose, values: Values) -> NDAr
     """On the platform as it stands, at least :data:`CLEARANCE` behind the table if there is room for it."""
     front = platform.position[0] - PLATFORM_DEPTH / 2
     height = PLATFORM_HEIGHT + values.get("platform_height", 0.0)
-    low, high = front + 0.055, min(front + 0.14, FARTHEST)
+    low = front + 0.05  # 1 cm of its foot is over the edge
+    high = max(low + 0.001, min(front + 0.14, FARTHEST))
     places = [np.array((x, box.position[1], height)) for x in np.arange(low, high, 0.005)]
     free = [place for place in places if _distance_from_board(place, table, values) >= CLEARANCE] or places[-1:]
     fraction = (box.position[0] - _ON_PLATFORM_X[0]) / (_ON_PLATFORM_X[1] - _ON_PLATFORM_X[0])
@@ -156,13 +157,20 @@ def admissible(poses: dict[str, Pose], values: Values) -> bool:
     return table_lift.admissible(poses, values) and beside
 
 
+def _left_alone(world: World) -> bool:
+    others = ("table", "platform", ROBOT)
+    return bool(world.contacts("box", BENCH.name)) and not any(world.contacts("box", other) for other in others)
+
+
+BOX_ASIDE = Condition("box on bench, free of all else", _left_alone)
+
 # ---------------------------------------------------------------------- what is seen
 
 
 def lowest(box: Pose) -> float:
-    """Height of the lowest corner of the canister's body, m."""
-    vertical = np.abs(box.rotation_matrix()[2])
-    return float((box @ Pose((0.0, 0.0, BODY / 2))).position[2] - 0.5 * vertical @ (EDGE, EDGE, BODY))
+    """Height of the lowest corner of the canister, m."""
+    vertical = box.rotation_matrix()[2]
+    return float(box.position[2] + min(vertical @ part.centre - 0.5 * np.abs(vertical) @ part.size for part in _SHAPE))
 
 
 def aside(scene: Scene) -> bool:
@@ -199,12 +207,19 @@ def _tool(pitch: float, heading: float) -> Rotation:
     return Rotation.from_euler("z", heading) * Rotation.from_matrix(np.array(((-s, 0, c), (0, 1, 0), (-c, 0, -s))))
 
 
-def _grip(scene: Scene) -> Pose:
-    """A hand at the post: across it, and the steeper the nearer it is, because a hand that is near and high cannot be flat."""
+def _grip(scene: Scene, side: str) -> Pose:
+    """A hand at the post, jaws across it.
+
+    It is the steeper the nearer it is, because a hand that is near and high cannot be flat. Where the post is far, the hand is
+    turned up to 10 degrees towards the way the arm points: the jaws are wide enough for that.
+    """
     box = scene.objects["box"]
     point, axes = _grip_point(box), box.rotation_matrix()
     if axes[2, 2] > 0.7:
         heading = math.remainder(math.atan2(axes[1, 0], axes[0, 0]), math.pi / 2)
+        arm = SIGN[side] * math.atan2(SIGN[side] * point[1] - SHOULDER_Y, point[0])
+        most = math.radians(float(np.interp(point[0], (0.85, 0.92), (0.0, 10.0))))
+        heading += min(most, max(-most, arm - heading))
         pitch = math.radians(float(np.interp(point[0], (0.60, 0.85), (65.0, 45.0))))
     else:  # lying: from above, jaws across the post
         heading = math.remainder(math.atan2(axes[1, 2], axes[0, 2]), math.pi)
@@ -214,7 +229,7 @@ def _grip(scene: Scene) -> Pose:
 
 def _at_post(side: str, opening: float, back_off: float = 0.0) -> Callable[[Scene], Hands]:
     def goal(scene: Scene) -> Hands:
-        return scene.hands | {side: HandCommand(_grip(scene) @ Pose((0.0, 0.0, -back_off)), opening)}
+        return scene.hands | {side: HandCommand(_grip(scene, side) @ Pose((0.0, 0.0, -back_off)), opening)}
 
     return goal
 
@@ -224,7 +239,7 @@ def _lifted(side: str) -> Callable[[Scene], Hands]:
 
     def goal(scene: Scene) -> Hands:
         rise = max(0.0, TRANSIT - lowest(scene.objects["box"]))
-        return scene.hands | {side: HandCommand(_grip(scene).translated((0.0, 0.0, rise)), 0.0)}
+        return scene.hands | {side: HandCommand(_grip(scene, side).translated((0.0, 0.0, rise)), 0.0)}
 
     return goal
 
@@ -288,7 +303,7 @@ PICK_AND_PUT = CLEARING[0].frames + CLEARING[1].frames
 def make_scene(values: Values) -> Task:
     """The task for some values of its factors."""
     lift = table_lift.make_scene(values)
-    grasp, move, *rest = lift.primitives
+    grasp, *rest = lift.primitives
     yaw = math.radians(values.get("box_yaw", 0.0))
     bounds = ((_ASIDE_X[0], -_ASIDE_Y[1], 0.0), (_ON_PLATFORM_X[1], _ASIDE_Y[1], TOP))
     table = lift.placements["table"]
@@ -306,21 +321,13 @@ def make_scene(values: Values) -> Task:
         observed=("table", "box"),
         primitives=(
             *CLEARING,
-            grasp.needing(*grasp.needs, unless=IN_THE_WAY),
-            move.needing(*move.needs, ASIDE_NEED),
-            *rest,
+            replace(grasp, unless=IN_THE_WAY),
+            *(replace(p, needs=(*p.needs, ASIDE_NEED)) if p.name in ("move", "lift") else p for p in rest),
         ),
         length=lift.horizon,
         longest=lift.horizon + PICK_AND_PUT,
-        success=(
-            *lift.success,
-            touching("box", BENCH.name),
-            *(not_touching("box", other) for other in ("table", "platform", ROBOT)),
-        ),
-        stages=(
-            Stage("box aside", (touching("box", BENCH.name), not_touching("box", ROBOT))),
-            Stage("table raised", (raised("table", 0.05),)),
-        ),
+        success=(*lift.success, BOX_ASIDE),
+        stages=(Stage("box aside", (BOX_ASIDE,)), Stage("table raised", (raised("table", 0.05),))),
         factors=(*lift.factors, *FACTORS),
         vary=make_scene,
         admissible=admissible,
