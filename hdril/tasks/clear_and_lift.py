@@ -1,7 +1,7 @@
 """Clear and lift: table lift, where a canister may be in the way. The hand that is nearer puts it aside first.
 
-In a quarter of the scenes the canister stands on the platform: it is higher than the table's board and the table cannot be set
-down there. In a quarter it stands on the table. In the others it stands aside on the bench already, and must be left alone.
+In a quarter of the scenes the canister stands on the platform, in the way of the table, which would shove it about. In a
+quarter it stands on the table. In the others it stands aside on the bench already, and must be left alone.
 """
 
 from __future__ import annotations

@@ -1,0 +1,148 @@
+"""What is particular to clear-and-lift: where the canister stands decides the plan, and the wrong plan fails."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from hdril.env import BimanualEnv
+from hdril.geometry import Pose
+from hdril.rollout import transitions
+from hdril.simulation.world import World
+from hdril.tasks import get_task
+from hdril.tasks.clear_and_lift import ASIDE, BOX_ASIDE, CLEARANCE, EDGE, lowest
+from hdril.tasks.expert import ScriptedExpert
+from hdril.tasks.primitives import Noise
+from hdril.tasks.scenario import Scenario
+from hdril.tasks.table_lift import DEPTH, PLATFORM_DEPTH, TOP, WIDTH
+
+NAME = "clear_and_lift"
+TASK = get_task(NAME)
+TABLE_LIFT = tuple(primitive.name for primitive in get_task("table_lift").primitives)
+PLACES = [(place, side) for place in ("table", "platform") for side in ("left", "right")]
+
+
+def where(scenario: Scenario) -> tuple[str, str]:
+    """What the canister stands on, and on which side."""
+    _, y, z = scenario.pose("box").position
+    return "bench" if z == 0.0 else "table" if z == TOP else "platform", "left" if y >= 0.0 else "right"
+
+
+@cache
+def seed_of(place: str, side: str) -> int:
+    """A seed whose scene has the canister there."""
+    return next(seed for seed in range(980_000, 981_000) if where(TASK.sample(seed)) == (place, side))
+
+
+def play(seed: int, script: tuple[str, ...] = TASK.labels) -> tuple[dict, list[str], BimanualEnv]:
+    """The last info of an episode, the primitives that were begun, and the world as it ends; of an expert that knows
+    the primitives in ``script`` alone."""
+    env = BimanualEnv(NAME)
+    chosen = tuple(p.needing() if script == TABLE_LIFT else p for p in TASK.primitives if p.name in script)
+    expert, begun, info = ScriptedExpert(replace(TASK, primitives=chosen), Noise(0.0)), [], {}
+    for transition in transitions(env, expert, seed):
+        info, explanation = transition.info, transition.decision.explanation
+        if explanation is not None and explanation.starts:
+            begun.append(expert.task.labels[explanation.primitive])
+    return info, begun, env
+
+
+def test_half_of_the_scenes_are_clear() -> None:
+    counts = dict.fromkeys([*PLACES, ("bench", "left"), ("bench", "right")], 0)
+    for seed in range(800):
+        counts[where(TASK.sample(seed))] += 1
+    aside = counts[("bench", "left")] + counts[("bench", "right")]
+    assert aside == pytest.approx(400, abs=60)
+    assert min(counts[key] for key in PLACES) > 60
+
+
+@pytest.mark.parametrize("level", ["nominal", "varied"])
+def test_the_canister_stands_on_what_it_should_and_in_nothing(level: str) -> None:
+    task = get_task(f"{NAME}:level={level}")
+    for seed in range(150):
+        scenario = task.sample(seed)
+        sizes = dict(task.at(scenario.values).attributes)
+        box, table, platform = (scenario.pose(name) for name in ("box", "table", "platform"))
+        x, y, _ = (table.inverse() @ box).position
+        outside = np.maximum(np.abs((x, y)) - (sizes["table.depth"] / 2, sizes["table.length"] / 2), 0.0)
+        match where(scenario)[0]:
+            case "table":
+                assert abs(x) < sizes["table.depth"] / 2 - EDGE / 2
+                assert abs(y) < 0.42 * sizes["table.length"] - EDGE / 2
+            case "platform":
+                assert box.position[2] == pytest.approx(sizes["platform.height"])
+                assert (
+                    abs(box.position[0] - platform.position[0]) <= PLATFORM_DEPTH / 2 - EDGE / 2 + 0.01 + 1e-9
+                )  # 1 cm may be over the edge
+                assert np.hypot(*outside) >= CLEARANCE - 1e-9
+            case _:
+                assert np.hypot(*outside) > CLEARANCE
+
+
+@pytest.mark.parametrize(("place", "side"), PLACES)
+def test_the_nearer_hand_puts_the_canister_aside_first(place: str, side: str) -> None:
+    info, begun, env = play(seed_of(place, side))
+    with closing(env):
+        assert info["is_success"], info
+        assert begun == [f"pick_{side}", f"put_{side}", *TABLE_LIFT]
+        x, y, _ = env.world.pose("box").position
+        assert (x, abs(y)) == pytest.approx(ASIDE, abs=0.06)
+        assert (y > 0.0) == (side == "left")
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_canister_that_stands_aside_is_left_alone(side: str) -> None:
+    seed = seed_of("bench", side)
+    info, begun, env = play(seed)
+    with closing(env):
+        assert info["is_success"], info
+        assert begun == list(TABLE_LIFT)
+        assert env.frame == TASK.horizon
+        drawn = TASK.sample(seed).pose("box").position
+        assert env.world.pose("box").position == pytest.approx(drawn, abs=2e-3)
+
+
+@pytest.mark.parametrize(("place", "side"), PLACES)
+def test_a_planner_that_skips_the_step_fails(place: str, side: str) -> None:
+    """The canister stays on the table, or the table shoves it over the platform or off the bench."""
+    info, begun, env = play(seed_of(place, side), TABLE_LIFT)
+    with closing(env):
+        assert begun[: len(TABLE_LIFT)] == list(TABLE_LIFT)
+        assert not info["is_success"]
+        assert not BOX_ASIDE.holds(env.world)
+
+
+@pytest.mark.parametrize(
+    ("turned", "expected"),
+    [((0.0, 0.0, 0.0, 1.0), 0.0), ((1.0, 0.0, 0.0, 1.0), -EDGE / 2), ((1.0, 0.0, 0.0, 0.0), -0.35)],
+)
+def test_lowest_corner(turned: tuple[float, ...], expected: float) -> None:
+    assert lowest(Pose((0.3, 0.2, 0.5), turned)) == pytest.approx(0.5 + expected)
+
+
+def test_a_canister_counts_as_aside_on_the_bench_alone() -> None:
+    """Standing against the platform or hanging in the air is not aside."""
+    spec = {body.name: body for body in TASK.bodies}
+    for box, expected in [
+        ((0.5, 0.82, 0.0), True),
+        ((0.5, 0.82, 0.2), False),
+        ((0.98 - 0.15 - EDGE / 2 + 0.0005, 0.0, 0.0), False),
+        ((0.98, 0.0, 0.12), False),
+    ]:
+        with closing(World()) as world:
+            world.add_urdf("robot", BimanualEnv(NAME).robot_spec.urdf(False), Pose((-3.0, 0.0, 1.0)))
+            world.add_body(spec["bench"], Pose((0.82, 0.0, 0.0)))
+            world.add_body(spec["platform"], Pose((0.98, 0.0, 0.0)))
+            world.add_body(spec["table"], Pose((0.55, 0.0, 0.0)))
+            world.add_body(spec["box"], Pose(box))
+            world.step(2)
+            assert BOX_ASIDE.holds(world) is expected, box
+
+
+def test_size_of_the_table_is_that_of_table_lift() -> None:
+    assert dict(TASK.attributes) == dict(get_task("table_lift").attributes)
+    assert (dict(TASK.attributes)["table.depth"], dict(TASK.attributes)["table.length"]) == (DEPTH, WIDTH)
