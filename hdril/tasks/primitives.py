@@ -258,14 +258,18 @@ def _bodies(grips: Grips) -> tuple[str, ...]:
 # ---------------------------------------------------------------------- needs
 
 
+WIDEST = 0.9
+"""A hand that is told to close and stays open further than this (0 to 1) has not closed."""
+
+
 def holds_grip(scene: Scene, side: str, grip: Grip, tolerance: float = 0.03, thinnest: float = 0.1) -> bool:
-    """Whether a hand holds what it grips: it was told to close, it is within ``tolerance`` m of its grip, and it is not empty.
+    """Whether a hand holds what it grips: it has closed as it was told, within ``tolerance`` m of its grip, and is not empty.
 
     A hand that closes on nothing is open by less than ``thinnest`` (0 to 1).
     """
     hand = scene.measured[side]
     near = np.linalg.norm(hand.pose.position - grip.tool(scene).position) < tolerance
-    return bool(scene.hands[side].opening < 0.5 and hand.opening > thinnest and near)
+    return bool(scene.hands[side].opening < 0.5 and thinnest < hand.opening < WIDEST and near)
 
 
 def holding(grips: Grips, tolerance: float = 0.03, thinnest: float = 0.1) -> Need:

@@ -143,7 +143,7 @@ def _grip(sign: float) -> Grip:
         yaw = sign * math.degrees(math.atan2(forwards[1], forwards[0]))
         aside = sign * (table @ Pose((0.0, y, GRIP_HEIGHT))).position[1]
         near = 30.0 * _ramp(yaw, 3.0, 10.0) + 5.0 * _ramp(yaw, 18.0, 28.0)
-        away = _ramp(-yaw, 9.0, 15.0) * _ramp(aside, 0.46, 0.54)
+        away = _ramp(-yaw, 6.0, 11.0) * _ramp(aside, 0.36, 0.44)
         nearer = max(0.015 * away, 0.02 * _far(scene))
         grip = Pose((-nearer, y, GRIP_HEIGHT), _PITCH)
         if away:
