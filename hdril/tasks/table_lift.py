@@ -27,6 +27,7 @@ from hdril.tasks.primitives import (
     Need,
     Primitive,
     Scene,
+    carry,
     extend,
     grasp,
     holding,
@@ -34,7 +35,6 @@ from hdril.tasks.primitives import (
     keeping,
     lift,
     move,
-    place,
     retract,
     stands_at,
 )
@@ -144,12 +144,12 @@ def _grip(sign: float) -> Grip:
         aside = sign * (table @ Pose((0.0, y, GRIP_HEIGHT))).position[1]
         near = 30.0 * _ramp(yaw, 3.0, 10.0) + 5.0 * _ramp(yaw, 18.0, 28.0)
         away = _ramp(-yaw, 6.0, 11.0) * _ramp(aside, 0.36, 0.44)
-        nearer = max(0.015 * away, 0.02 * _far(scene))
+        nearer = max(0.02 * away, 0.02 * _far(scene))
         grip = Pose((-nearer, y, GRIP_HEIGHT), _PITCH)
         if away:
-            half = 0.5 * sign * math.radians(10.0 * away)
+            half = 0.5 * sign * math.radians(20.0 * away)
             grip = Pose(grip.position, (Pose((0, 0, 0), (0.0, 0.0, math.sin(half), math.cos(half))) @ grip).quaternion)
-        return grip @ _turned(near + 20.0 * away) if near or away else grip
+        return grip @ _turned(near + 13.0 * away) if near or away else grip
 
     return Grip("table", pose)
 
@@ -182,10 +182,10 @@ def _spare_y(scene: Scene) -> float:
 def goal_x(scene: Scene) -> float:
     """Where the table goes on the platform, x, m: its middle, or nearer to the robot if the platform is far away.
 
-    The middles of the front legs stay on the platform, 5 mm from its edge or more.
+    The middles of the front legs stay on the platform, 2 cm from its edge or more: a heavy table swings back in the hands.
     """
     x = float(scene.objects["platform"].position[0])
-    return x - min(max(x - PLATFORM_X, 0.0), _spare_x(scene))
+    return x - min(max(x - PLATFORM_X, 0.0), _spare_x(scene) - 0.015)
 
 
 def goal_y(scene: Scene) -> float:
@@ -193,6 +193,19 @@ def goal_y(scene: Scene) -> float:
     y = float(scene.objects["platform"].position[1])
     spare = _spare_y(scene)
     return y - min(max(y, -spare), spare)
+
+
+def _set_down(table: Pose, scene: Scene) -> Pose:
+    """The table level on the platform, where it is over it, or as near to that as its legs allow: it may have swung back."""
+    x, y, _ = scene.objects["platform"].position
+    spare_x, spare_y = _spare_x(scene), _spare_y(scene)
+    return Pose(
+        (
+            min(max(table.position[0], x - spare_x), x + spare_x),
+            min(max(table.position[1], y - spare_y), y + spare_y),
+            height_of_platform(scene),
+        )
+    )
 
 
 def _far(scene: Scene) -> float:
@@ -266,7 +279,7 @@ def make_scene(values: Values) -> Task:
             _levelling(move("table", x=before_platform, y=0.0)).needing(HELD, ON_BENCH, unless=OFF_BENCH),
             lift("table", lambda scene: height_of_platform(scene) + 0.06).needing(HELD),
             extend("table", x=goal_x, y=goal_y, follows=("platform",)).needing(HELD, RAISED),
-            place("table", height_of_platform).needing(HELD, OVER_PLATFORM),
+            carry("place", "table", _set_down, jitter=0.5).needing(HELD, OVER_PLATFORM),
             retract().needing(ON_PLATFORM, OVER_PLATFORM),
         ),
         recovery=(keeping(retract(), _keeps),),

@@ -78,9 +78,9 @@ def test_a_handle_that_is_turned_away_and_far_aside_is_gripped_from_within(side:
     sign = SIGNS[side]
     turned = scene(yaw=-25.0 * sign, at=(0.5, 0.28 * sign, 0.0))
     tool, table = GRIPS[side].tool(turned), turned.objects["table"]
-    assert pitch(tool) > 60.0
+    assert pitch(tool) > 50.0
     heading = (table.inverse() @ tool).rotation_matrix()[:2, 2]
-    assert sign * math.degrees(math.atan2(heading[1], heading[0])) == pytest.approx(10.0, abs=0.5)
+    assert sign * math.degrees(math.atan2(heading[1], heading[0])) == pytest.approx(20.0, abs=0.5)
     near = scene(yaw=-25.0 * sign, at=(0.5, -0.1 * sign, 0.0))
     assert pitch(GRIPS[side].tool(near)) == pytest.approx(45.0)
 
