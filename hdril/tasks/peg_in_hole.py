@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdril.geometry import Pose, geodesic_distance
+from hdril.geometry import Pose, geodesic_distance, interpolate
 from hdril.simulation.actions import HandCommand
 from hdril.simulation.bodies import BodySpec, Box
 from hdril.simulation.robots.spec import SIDES
@@ -36,7 +36,9 @@ from hdril.tasks.primitives import (
     Scene,
     Segment,
     Targets,
+    at_grips,
     carry_each,
+    carry_to,
     hands_at,
     holding,
     lift_joined,
@@ -218,30 +220,32 @@ def _pitched(degrees: float) -> Rotation:
     return Rotation.from_matrix(np.array([[-s, 0.0, c], [0.0, 1.0, 0.0], [-c, 0.0, -s]]))
 
 
-def _across(x: float, heading: float) -> float:
-    """How far beyond the robot's middle a hand reaches at ``x``, m, if it points to its own side by ``-heading``, degrees.
+def _turned(x: float, y: float, heading: float) -> tuple[float, float]:
+    """How a hand takes a handle at (x, y), m, whose body is turned by ``heading``: its pitch and its own turn, degrees.
 
-    Measured with Baxter's inverse kinematics at the height of the handles, less 2 cm: two straight lines.
+    For the right hand: y > 0 is across the robot's middle. It points down by 60 degrees on its own side; across the middle, more
+    steeply near the robot and less steeply far from it. Where it reaches no further it turns by up to 15 degrees to where it
+    goes: the jaws then stand askew. The limits are straight lines fitted to Baxter's inverse kinematics, less 2 cm.
     """
-    straight = min(0.37 - 0.4 * (x - 0.45), 0.25 - 0.95 * (x - 0.70))
-    return straight + min(0.0027 * heading, 0.004 * heading)
+    outside = float(np.clip((-0.2 - y) / 0.2, 0.0, 1.0))
+    inner = np.clip(60.0 - 150.0 * (x - 0.60), 45.0, 75.0)
+    across = min(0.37 - 0.4 * (x - 0.45), 0.25 - 0.95 * (x - 0.70)) + min(0.0027 * heading, 0.004 * heading)
+    out = -0.86 + 0.7 * max(x - 0.50, 0.0) + 0.005 * heading
+    turn = np.clip((y - across) / 0.003, 0.0, 15.0) - np.clip((out - y) / 0.003, 0.0, 15.0)
+    return float((1.0 - outside) * inner + outside * 60.0), float(turn)
 
 
 def _grip(half: str, side: str, y: float) -> Grip:
-    """A hand on the half's left (``y`` = 1) or right (-1) handle.
-
-    It points down by 60 degrees, more steeply near the robot and less steeply far from it, which reaches further. Where the
-    handle is too far on the other side, the hand turns to there by up to 15 degrees: the jaws then stand askew.
-    """
+    """A hand on the half's left (``y`` = 1) or right (-1) handle, turned to where it reaches it: :func:`_turned`."""
     mirror = 1.0 if side == "right" else -1.0
 
     def pose(scene: Scene) -> Pose:
         body, handle = scene.objects[half], Pose((0.0, y * HANDLE_Y * _length(scene, half) / WIDTH, GRIP_HEIGHT))
         at = (body @ handle).position
-        heading = mirror * math.degrees(_heading(body))
-        pitch = float(np.clip(60.0 - 150.0 * (at[0] - 0.60), 45.0, 75.0))
-        turn = mirror * float(np.clip((mirror * at[1] - _across(at[0], heading)) / 0.003, 0.0, 15.0))
-        return Pose(handle.position, (Rotation.from_euler("z", turn, degrees=True) * _pitched(pitch)).as_quat())
+        pitch, turn = _turned(at[0], mirror * at[1], mirror * math.degrees(_heading(body)))
+        return Pose(
+            handle.position, (Rotation.from_euler("z", mirror * turn, degrees=True) * _pitched(pitch)).as_quat()
+        )
 
     return Grip(half, pose)
 
@@ -390,6 +394,34 @@ def _high(scene: Scene) -> Hands:
     }
 
 
+def _reach_from_rest(name: str, grips: Grips, frames: int) -> Primitive:
+    """As :func:`reach`, but hands that begin low rise first: on the straight way they would drag a half along."""
+    over, rise = at_grips(grips, 1.0, above=ABOVE), 3
+
+    def part_way(scene: Scene) -> Hands:
+        goals, hands = over(scene), scene.hands
+        # The lower a hand is, the more steeply it rises.
+        parts = {side: 0.2 * float(np.clip((hands[side].pose.position[2] - 0.38) / 0.05, 0.0, 1.0)) for side in SIDES}
+        poses = {side: interpolate(hands[side].pose, goal.pose, parts[side]) for side, goal in goals.items()}
+        return {
+            side: HandCommand(Pose((*pose.position[:2], goals[side].pose.position[2]), pose.quaternion), 1.0)
+            for side, pose in poses.items()
+        }
+
+    bodies = tuple(dict.fromkeys(grip.body for grip in grips.values()))
+    return Primitive(name, (Segment(rise, part_way, follows=bodies), Segment(frames - rise, over, follows=bodies)))
+
+
+def _connect(frames: int) -> Primitive:
+    """Square the halves opposite each other where they are, then press them together.
+
+    Without the first part, the peg enters the hole before the errors that the alignment left are made good.
+    """
+    square = carry_to(HELD, _apart(lambda scene, half: float(scene.objects[half].position[1]), *HALVES))
+    press = carry_to(HELD, _apart(_pressed_y, *HALVES))
+    return Primitive("connect", (Segment(3, square, jitter=0.1), Segment(frames - 3, press, jitter=0.1)))
+
+
 def _release(name: str, frames: int) -> Primitive:
     """Open the hands and raise them."""
     return Primitive(
@@ -412,7 +444,7 @@ def _from_above(primitive: Primitive, *needs: Need, unless: Need | None = None) 
 def _phase(half: str, targets: Targets, frames: int, *needs: Need) -> tuple[Primitive, ...]:
     """Take a half with both hands to where it shall stand, and leave it there. Its first primitive needs ``needs``."""
     name, done, grips = half.removesuffix("_half"), _done(half), ON[half]
-    first = reach(f"reach_{name}", grips, frames)
+    first = (reach if needs else _reach_from_rest)(f"reach_{name}", grips, frames)
     move = carry_each(f"move_{name}", dict.fromkeys(SIDES, half), targets, frames, 0.5, rigid=True)
     return (
         _from_above(first, *needs, unless=done) if needs else first.needing(unless=done),
@@ -432,7 +464,7 @@ def _primitives(frames: int = 10) -> tuple[Primitive, ...]:
         carry_each("align", HELD, _apart(_aligned_y, *HALVES), frames, jitter=0.25).needing(
             held, firm, unless=INSERTED
         ),
-        carry_each("connect", HELD, _apart(_pressed_y, *HALVES), frames, jitter=0.1).needing(held, firm, OPPOSITE),
+        _connect(frames).needing(held, firm, OPPOSITE),
         lift_joined("lift", rise=0.12, frames=frames).needing(held, CLOSED),
     )
 
@@ -482,7 +514,7 @@ def make_scene(values: Values, clearance: float, chamfer: float) -> Task:
             _EVEN,
             closed,
         ),
-        dwell=5,
+        dwell=7,  # so that the lift, which succeeds from its fifth frame on, is not cut off
         measures=(
             Measure("gap_mm", lambda world: 1e3 * gap(world, widths)),
             Measure("insertion_mm", lambda world: 1e3 * insertion(world, widths)),
