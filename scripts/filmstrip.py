@@ -22,18 +22,29 @@ from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.primitives import Noise
 
 
+def ends(env: BimanualEnv, expert: ScriptedExpert, seed: int) -> dict[int, str]:
+    """Names of the primitives that the expert plays, by their last frame."""
+    names, starts = [], []
+    for frame, transition in enumerate(transitions(env, expert, seed)):
+        explanation = transition.decision.explanation
+        assert explanation is not None
+        if explanation.starts:
+            starts.append(frame)
+        names.append(env.task_spec.labels[explanation.primitive])
+    return {end - 1: names[end - 1] for end in (*starts[1:], len(names))}
+
+
 def frames(task: str, seed: int) -> list[tuple[str, np.ndarray]]:
     """(name, picture) at the end of each primitive."""
     env = BimanualEnv(task, meshes=True)
     expert = ScriptedExpert(env.task_spec, Noise(0.0))
     camera = replace(env.task_spec.camera, width=480, height=400)
-    ends = np.cumsum([primitive.frames for primitive in env.task_spec.primitives])
     pictures = []
     with closing(env):
-        for frame, _ in enumerate(transitions(env, expert, seed), start=1):
-            if frame in ends:
-                name = env.task_spec.primitives[int(np.searchsorted(ends, frame))].name
-                pictures.append((name, env.world.render(camera)))
+        last = ends(env, expert, seed)
+        for frame, _ in enumerate(transitions(env, expert, seed)):
+            if frame in last:
+                pictures.append((last[frame], env.world.render(camera)))
     return pictures
 
 

@@ -66,7 +66,7 @@ def test_a_task_from_another_package_is_recorded(package: Path, tmp_path: Path) 
 def follow(page: str, folder: Path) -> None:
     """Make the changes of a how-to page: its blocks of code come in pairs, the old lines and the new ones."""
     text = (ROOT / "docs/how-to" / page).read_text()
-    blocks = re.findall(r"```(python|toml)\n(.*?)\n```", text, re.DOTALL)
+    blocks = re.findall(r"```{code-block} (python|toml)\n(.*?)\n```", text, re.DOTALL)
     assert len(blocks) >= 4
     assert len(blocks) % 2 == 0
     for (kind, old), (_, new) in zip(blocks[::2], blocks[1::2], strict=True):
