@@ -76,7 +76,9 @@ def outcomes(task: str, n_envs: int, use_async: bool, episodes: int, **options) 
     return {row["seed"]: row["success"] for row in info["per_episode"]}
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    "task", [task if task == "table_lift" else pytest.param(task, marks=pytest.mark.long) for task in TASKS]
+)
 def test_same_outcomes_for_one_several_and_asynchronous_environments(task: str) -> None:
     one = outcomes(task, 1, False, 6)
     assert set(one.values()) == {True, False}, "the seeds should hold both outcomes"

@@ -158,7 +158,7 @@ def test_same_seed_same_episode_bit_for_bit_in_another_process(name: str) -> Non
 def test_one_arm_fails_where_scenes_vary(task: str, idle: str) -> None:
     env = BimanualEnv(f"{task}:level=varied")
     with closing(env):
-        for seed in range(920_000, 920_004):
+        for seed in range(920_000, 920_002):
             _, info = play(env, seed, idle=idle)
             assert not info["is_success"], f"seed {seed}: the {idle} hand is not needed"
 
