@@ -98,14 +98,14 @@ class BimanualEnv(gym.Env):
         robot, task, world = self.robot_spec, self.task_spec, World(self._physics)
         world.add_urdf(ROBOT, robot.urdf(self._meshes), robot.base, self_collision=True)
         world.ignore_collisions(ROBOT, robot.ignored_collisions(world.links(ROBOT)))
-        pads = [pad for arm in robot.arms.values() for pad in arm.gripper.pads]
-        world.set_link_dynamics(
-            ROBOT,
-            pads,
-            lateralFriction=robot.actuation.pad_friction,
-            spinningFriction=robot.actuation.pad_torsion,
-            frictionAnchor=1,
-        )
+        for side, arm in robot.arms.items():
+            world.set_link_dynamics(
+                ROBOT,
+                arm.gripper.pads,
+                lateralFriction=robot.actuation.pad_friction,
+                spinningFriction=robot.actuation.pad_torsion,
+                frictionAnchor=int(side in task.anchored_hands),
+            )
         for arm in robot.arms.values():
             # One motor drives both fingers (the URDF's mimic tag, which PyBullet ignores). Fingers driven apart push
             # against each other with equal forces, and what they hold floats between them.

@@ -40,12 +40,12 @@ from hdril.tasks.task import Task, Uniform, Values, fixed
 LENGTH, MASS = 0.34, 0.25
 COUNTER = 0.18
 """Height of the counter. On the bench itself, 1.1 m below the shoulders, no hand can point down."""
-RACK_HEIGHT, POST, WALL = {False: 0.06, True: 0.10}, 0.05, 0.08
+RACK_HEIGHT, POST, WALL = {False: 0.06, True: 0.10}, 0.03, 0.08
 BAR_X, BAR_Y = (0.46, 0.56), (0.56, 0.64)
 RACK_X, RACK_Y = (0.48, 0.54), (0.54, 0.60)
 YAW = math.radians(15.0)
 REST = {
-    False: Rest(upright=False, tolerance=(0.03, 0.012), above=0.12, frames=(12, 7, 8)),
+    False: Rest(upright=False, tolerance=(0.03, 0.012), above=0.12, frames=(12, 11, 8)),
     True: Rest(upright=True, tolerance=(0.015, 0.015), above=0.15, frames=(22, 13, 12)),
 }
 """Flat, and upright."""
@@ -73,7 +73,9 @@ EVENTS = (
 
 # ---------------------------------------------------------------------- scene
 
-_COUNTER = BodySpec("counter", (Box((0.60, 1.70, COUNTER), (0.0, 0.0, COUNTER / 2), GREY),), friction=0.5)
+_COUNTER = BodySpec(
+    "counter", (Box((0.60, 1.70, COUNTER), (0.0, 0.0, COUNTER / 2), GREY),), friction=0.5, anchored=False
+)
 
 
 @dataclass(frozen=True)
@@ -114,20 +116,21 @@ def _bar(values: Values) -> BodySpec:
         (Box((LENGTH * values.get("size", 1.0), THICKNESS, THICKNESS), (0.0, 0.0, 0.0), WOOD),),
         mass=MASS * values.get("mass", 1.0),
         friction=0.8 * values.get("friction", 1.0),
+        anchored=False,
     )
 
 
 def _cradle(height: float) -> BodySpec:
-    """A block with two pairs of posts on it; the bar lies between them along x."""
-    y = THICKNESS / 2 + 0.010 + 0.01
-    posts = [(a * 0.04, b * y) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
-    return BodySpec(
-        "rack",
-        (
-            Box((0.16, 0.11, height), (0.0, 0.0, height / 2), STEEL),
-            *(Box((0.02, 0.02, POST), (x, y, height + POST / 2), STEEL) for x, y in posts),
-        ),
-    )
+    """A block with two pairs of posts on it, and a plate on each that leads the bar in; it lies between them along x."""
+    inner, post = THICKNESS / 2 + 0.010, 0.02
+    boxes = [Box((0.16, 0.11, height), (0.0, 0.0, height / 2), STEEL)]
+    for x in (-0.035, 0.035):
+        for quarter in (1, 3):
+            upright = Box((post, post, POST), (inner + post / 2, 0.0, height + POST / 2), STEEL)
+            for box in (upright, _lead_in(inner, height + POST, post)):
+                turned = _turned(box, quarter)
+                boxes.append(replace(turned, centre=(turned.centre[0] + x, *turned.centre[1:])))
+    return BodySpec("rack", tuple(boxes), anchored=False)
 
 
 def _socket(height: float) -> BodySpec:
@@ -138,7 +141,7 @@ def _socket(height: float) -> BodySpec:
         x, z = (inner + wall) / 2, height + WALL / 2
         boxes.append(_turned(Box((wall, inner + 2 * wall, WALL), (x, 0.0, z), STEEL), quarter))
         boxes.append(_turned(_lead_in(inner / 2, height + WALL, inner), quarter))
-    return BodySpec("rack", tuple(boxes))
+    return BodySpec("rack", tuple(boxes), anchored=False)
 
 
 def _lead_in(x: float, z: float, width: float) -> Box:
@@ -228,6 +231,10 @@ def make_scene(values: Values, upright: bool = False) -> Task:
             Stage("handed over", (Condition("bar in the receiver's hand alone", _passed),)),
         ),
         dwell=9,
+        # An anchored contact keeps the normal that it had first. After the hand has turned by a right angle, that points along
+        # the bar, and the flat pads of the left hand stick to it when they open (in one episode of fifteen; without anchors in
+        # none of 80). From the half-round pads of the right hand, which do not stick, the bar would turn away without them.
+        anchored_hands=("right",),
         factors=FACTORS,
         events=EVENTS,
         vary=partial(make_scene, upright=upright),

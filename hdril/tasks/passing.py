@@ -325,12 +325,12 @@ def carry(side: str, rest: Rest) -> Primitive:
 
 
 def insert(side: str, rest: Rest) -> Primitive:
-    """Lower the bar into the rack; one that will stand is first squared, because it turns in the fingers as it is raised."""
-    square = 4 if rest.upright else 0
+    """Square the bar, which has turned in the fingers while it was carried, and lower it into the rack."""
+    square = 4
     return Primitive(
         f"insert_{side}",
         (
-            *((Segment(square, _to_rack(side, rest, rest.above), jitter=0.25, follows=("rack",)),) if square else ()),
+            Segment(square, _to_rack(side, rest, rest.above), jitter=0.25, follows=("rack",)),
             Segment(rest.frames[1] - square, _to_rack(side, rest, 0.0), jitter=0.25, follows=("rack",)),
         ),
         needs=(_held(side), Need("bar over the rack", rest.over)),

@@ -12,6 +12,7 @@ from gymnasium.utils.seeding import np_random
 
 from hdril.geometry import POSE_AXES, Pose
 from hdril.simulation.bodies import BodySpec
+from hdril.simulation.robots.spec import SIDES
 from hdril.simulation.sensor import SensorSpec
 from hdril.simulation.world import Camera, Physics, World
 from hdril.tasks.conditions import Condition, Measure, Stage, failed
@@ -121,6 +122,8 @@ class Task:
     """Frames of the shortest plan; the sum of the primitives unless given. Some plans skip primitives."""
     longest: int | None = None
     """Frames of the longest plan; those of the shortest unless given."""
+    anchored_hands: tuple[str, ...] = SIDES
+    """Hands whose pads have friction anchors, which stop what they hold from creeping through them."""
     variation: Variation = NOMINAL
     detailed: bool = False
     """Whether ``also_observed`` and ``attributes`` are observed."""
