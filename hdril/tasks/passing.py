@@ -205,10 +205,11 @@ def _carried(side: str, free: Vector, approach: Vector, place: Callable[[Scene],
     """One hand with the bar in it, whose middle goes to ``place(scene)``; the other hand stays."""
 
     def goal(scene: Scene) -> Hands:
-        bar, hand = scene.objects["bar"], scene.hands[side]
-        there = turned(bar, scene.measured[side].pose, held_end(scene, side), free, approach)
+        # From where the hand is, not from where it was told to be: after a long way the arm lags, and the bar with it.
+        bar, hand = scene.objects["bar"], scene.measured[side].pose
+        there = turned(bar, hand, held_end(scene, side), free, approach)
         motion = Pose(place(scene), there.quaternion) @ bar.inverse()
-        return scene.hands | {side: HandCommand(motion @ hand.pose, hand.opening)}
+        return scene.hands | {side: HandCommand(motion @ hand, scene.hands[side].opening)}
 
     return goal
 
