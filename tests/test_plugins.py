@@ -118,7 +118,7 @@ print(json.dumps(dict(
     assert said["robots"] == ["baxter", "second_baxter"]
     assert said["unknown"] == f"unknown task 'chess'; choose from: {', '.join([*TASKS, 'raise_table'])}"
     assert (said["recorded"], said["made"], said["robot"]) == ("raise_table", "raise_table", "second_baxter")
-    assert said["higher"] == {"height": 0.2}
+    assert said["higher"]["height"] == 0.2
     assert len(said["seeds"]) == 1
     assert said["horizon"] == 22
     assert (tmp_path / "data" / "meta" / "info.json").exists()

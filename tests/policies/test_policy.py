@@ -232,6 +232,8 @@ def test_one_primitive_and_one_episode_and_a_batch_of_one(copy: Path) -> None:
         table = pq.read_table(file)
         label = pa.array([0] * len(frame), pa.int64())
         table = table.set_column(table.column_names.index("subtask_index"), "subtask_index", label)
+        start = pa.array((frame["frame_index"] == 0).to_list())
+        table = table.set_column(table.column_names.index("subtask_start"), "subtask_start", start)
         pq.write_table(table.filter(pc.equal(table["episode_index"], 0)), file)
     names = pd.DataFrame({"subtask_index": [0]}, index=pd.Index(["lift"], name="subtask"))
     names.to_parquet(copy / "meta/subtasks.parquet")

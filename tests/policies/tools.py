@@ -91,6 +91,7 @@ def vary_lengths(root: Path) -> Path:
     """Relabel a dataset, so that primitives are one to three frames longer in some episodes than in others."""
     shifted = {e: [s + ((e + 2 * i) % 4 if i else 0) for i, s in enumerate(STARTS)] for e in range(6)}
     edit(root, "subtask_index", lambda episode, frame, _: int(np.searchsorted(shifted[episode], frame, "right")) - 1)
+    edit(root, "subtask_start", lambda episode, frame, _: frame in shifted[episode])
     return root
 
 
