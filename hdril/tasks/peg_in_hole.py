@@ -39,7 +39,6 @@ from hdril.tasks.primitives import (
     at_grips,
     carry_each,
     carry_to,
-    hands_at,
     holding,
     lift_joined,
     lower,
@@ -59,6 +58,8 @@ FACE_Z = TOP - BOARD / 2  # where the gap is measured: joined halves sag by 3 de
 MAX_GAP = 0.005
 ABOVE = 0.12
 """How high hands travel over the grips, m."""
+HINDERED = 0.03
+"""A hand that is further than this, m, from where it was told to be has been hindered."""
 
 WOOD, DARK, STEEL = (0.80, 0.62, 0.42, 1.0), (0.45, 0.31, 0.20, 1.0), (0.35, 0.42, 0.50, 1.0)
 
@@ -329,15 +330,25 @@ OVER_ALL = Need(
     "hands over all handles",
     lambda scene: all(hand.pose.position[2] > GRIP_HEIGHT + 0.04 for hand in scene.measured.values()),
 )
-ALWAYS = Need("nothing", lambda scene: True)
+STRAIGHT = Need(
+    "hands rise straight",  # an arm with a stopped motor swings aside, and its open hand takes the half along
+    lambda scene: all(
+        hand.pose.position[2] > GRIP_HEIGHT + 0.05
+        or math.dist(hand.pose.position[:2], scene.hands[side].pose.position[:2]) < HINDERED
+        for side, hand in scene.measured.items()
+    ),
+)
 
 
 def _over(grips: Grips) -> Need:
-    """Each hand is in a cone over its grip or at it: a hand that comes from far is 11 cm late when the motion ends."""
+    """Each hand is in a cone over its grip or at it: a hand that comes from far is 11 cm late when the motion ends.
+
+    One that is higher was stopped, and would come down beside its handle.
+    """
 
     def holds(scene: Scene) -> bool:
         offsets = [scene.measured[side].pose.position - grip.tool(scene).position for side, grip in grips.items()]
-        return all(math.hypot(x, y) < 0.05 + 1.5 * max(z, 0.0) and z > -0.03 for x, y, z in offsets)
+        return all(math.hypot(x, y) < 0.05 + 1.5 * max(z, 0.0) and -0.03 < z < ABOVE + 0.06 for x, y, z in offsets)
 
     return Need("hands over the handles", holds)
 
@@ -385,13 +396,19 @@ def _opposite(scene: Scene) -> dict[str, Pose]:
     return {RIGHT: Pose((x, _aligned_y(scene, RIGHT), z))}
 
 
-def _high(scene: Scene) -> Hands:
-    """Open hands straight above where they are."""
-    height = GRIP_HEIGHT + ABOVE
-    places = {side: hand.pose for side, hand in scene.hands.items()}
-    return {
-        side: HandCommand(Pose((*pose.position[:2], height), pose.quaternion), 1.0) for side, pose in places.items()
-    }
+def _opened(height: float | None = None) -> Callable[[Scene], Hands]:
+    """Open hands where they were told to be, or where they are if they were hindered; at ``height``, m, if it is given."""
+
+    def goal(scene: Scene) -> Hands:
+        hands = {}
+        for side, told in scene.hands.items():
+            pose, measured = told.pose, scene.measured[side].pose
+            pose = pose if math.dist(pose.position, measured.position) < HINDERED else measured
+            z = pose.position[2] if height is None else height
+            hands[side] = HandCommand(Pose((*pose.position[:2], z), pose.quaternion), 1.0)
+        return hands
+
+    return goal
 
 
 def _reach_from_rest(name: str, grips: Grips, frames: int) -> Primitive:
@@ -422,11 +439,17 @@ def _connect(frames: int) -> Primitive:
     return Primitive("connect", (Segment(3, square, jitter=0.1), Segment(frames - 3, press, jitter=0.1)))
 
 
+@dataclass(frozen=True)
+class _Release(Primitive):
+    """Open the hands and raise them. It can be begun at any time; what it needs is looked at while it goes on."""
+
+    def possible(self, scene: Scene) -> bool:
+        return True
+
+
 def _release(name: str, frames: int) -> Primitive:
-    """Open the hands and raise them."""
-    return Primitive(
-        name, (Segment(2, hands_at(1.0), jitter=0.0), Segment(frames - 2, _high, jitter=0.25)), (ALWAYS,), HIGH
-    )
+    rise = Segment(frames - 2, _opened(GRIP_HEIGHT + ABOVE), jitter=0.25)
+    return _Release(name, (Segment(2, _opened(), jitter=0.0), rise), (STRAIGHT,), HIGH)
 
 
 @dataclass(frozen=True)
