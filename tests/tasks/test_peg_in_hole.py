@@ -11,11 +11,12 @@ import pytest
 from hdril.env import BimanualEnv
 from hdril.geometry import Pose
 from hdril.rollout import transitions
-from hdril.tasks import get_task, peg_in_hole
+from hdril.tasks import get_task, half_tables, joining
 from hdril.tasks.events import Event
 from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.footprint import apart
-from hdril.tasks.peg_in_hole import LEFT, RIGHT, SIGN, gap, insertion, make_task
+from hdril.tasks.half_tables import LEFT, RIGHT, SIGN
+from hdril.tasks.peg_in_hole import gap, insertion, make_task
 from hdril.tasks.primitives import Noise, Primitive, carry_each, lift_joined, lower, reach
 
 TASK = get_task("peg_in_hole")
@@ -43,7 +44,7 @@ def play(seed: int, script: tuple[Primitive, ...], name: str = TASK.name) -> tup
 def test_unconnected_halves_cannot_be_lifted_level(handle: float) -> None:
     """Each hand lifts the half on its side by one of its handles, where it stands."""
     held = {"left": LEFT, "right": RIGHT}
-    grips = {side: peg_in_hole._grip(half, side, handle * SIGN[half]) for side, half in held.items()}
+    grips = {side: joining.grip_on(half, side, handle * SIGN[half]) for side, half in held.items()}
     for seed in range(950_000, 950_020):
         info, _, poses = play(seed, (reach("reach", grips), lower("grasp", grips), lift_joined("lift", squeeze=0.0)))
         assert not info["is_success"]
@@ -55,7 +56,7 @@ def test_unconnected_halves_cannot_be_lifted_level(handle: float) -> None:
 
 def test_a_peg_that_is_half_inserted_fails() -> None:
     held = {"left": LEFT, "right": RIGHT}
-    wide = peg_in_hole._apart(lambda scene, half: SIGN[half] * (peg_in_hole.WIDTH / 2 + 0.02), LEFT, RIGHT)
+    wide = joining.squared_at(lambda scene, half: SIGN[half] * (half_tables.WIDTH / 2 + 0.02), LEFT, RIGHT)
     stop = carry_each("connect", held, wide, 10)
     for seed in range(951_000, 951_003):
         info, infos, _ = play(seed, (*TASK.primitives[:-2], stop, lift_joined(frames=10)))
@@ -146,8 +147,8 @@ def test_gap_and_insertion_know_the_size_of_the_halves(half: str, scale: float) 
     lengths = dict(scene.attributes)
     widths = (lengths["left_half.length"], lengths["right_half.length"])
     poses = Pose((0.6, widths[0] / 2, 0.0)), Pose((0.6, -widths[1] / 2, 0.0))
-    assert peg_in_hole._between(*poses, widths) == pytest.approx(0.0, abs=1e-9)
-    assert peg_in_hole._depth_of_peg(*poses, widths) == pytest.approx(peg_in_hole.PEG_LENGTH)
+    assert half_tables.gap_between(*poses, widths) == pytest.approx(0.0, abs=1e-9)
+    assert half_tables.depth_of_peg(*poses, widths) == pytest.approx(half_tables.PEG_LENGTH)
 
 
 def test_halves_never_start_inside_each_other() -> None:
