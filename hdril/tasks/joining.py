@@ -310,13 +310,13 @@ def _from_above(primitive: Primitive, *needs: Need, unless: Need | None = None) 
 
 
 def _phase(half: str, targets: Targets, frames: int, *needs: Need) -> tuple[Primitive, ...]:
-    """Take a half with both hands to where it shall stand, and leave it there. Its first primitive needs ``needs``."""
+    """Take a half with both hands to where it shall stand, and leave it there. To reach and to grasp it needs ``needs``."""
     name, done, grips = half.removesuffix("_half"), _done(half), ON[half]
     first = (reach if needs else _reach_from_rest)(f"reach_{name}", grips, frames)
     move = carry_each(f"move_{name}", dict.fromkeys(SIDES, half), targets, frames, 0.5, rigid=True)
     return (
         _from_above(first, *needs, unless=done) if needs else first.needing(unless=done),
-        _from_above(lower(f"grasp_{name}", grips, frames), _over(grips), unless=done),
+        _from_above(lower(f"grasp_{name}", grips, frames), _over(grips), *needs, unless=done),
         move.needing(holding(grips), unless=done),
         _release(f"retract_{name}", frames),
     )
