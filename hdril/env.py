@@ -134,6 +134,7 @@ class BimanualEnv(gym.Env):
             raise ValueError(f"this is an environment of {self.task}, the scenario is of {scenario.task}")
         self.scenario: Scenario = scenario
         self.task_spec = self._declared.at(scenario.values)
+        self._whole = replace(self.task_spec, detailed=True)
         self._world = self._new_world()
         self.controller.start(self._world, self._posture_offsets())
         self.controller.hold(SETTLE_PERIODS * self._physics.substeps)
@@ -204,20 +205,24 @@ class BimanualEnv(gym.Env):
 
     def _observe(self) -> dict[str, NDArray[np.float32]]:
         task = self.task_spec
-        objects = self._sensor.observe([self.world.pose(name) for name in task.objects])
+        self._hands = self.controller.observe().astype(np.float32)
+        self._poses = {name: self.world.pose(name) for name in task.objects}
+        objects = self._sensor.observe(list(self._poses.values()))
         attributes = [value for _, value in task.attributes if task.detailed]
         return {
-            "agent_pos": self.controller.observe().astype(np.float32),
+            "agent_pos": self._hands.copy(),
             "environment_state": np.concatenate([objects, attributes]).astype(np.float32),
         }
 
     def exact_observation(self) -> dict[str, NDArray[np.float32]]:
         """The observation without noise and delay, with everything that may vary between scenes: for demonstrators."""
-        task = replace(self.task_spec, detailed=True)
-        poses = [self.world.pose(name).aligned_to(IDENTITY_QUATERNION).as_vector() for name in task.objects]
+        poses = [self._poses.get(name) or self.world.pose(name) for name in self._whole.objects]
+        seen = [pose.aligned_to(IDENTITY_QUATERNION).as_vector() for pose in poses]
         return {
-            "agent_pos": self.controller.observe().astype(np.float32),
-            "environment_state": np.concatenate([*poses, [value for _, value in task.attributes]]).astype(np.float32),
+            "agent_pos": self._hands.copy(),
+            "environment_state": np.concatenate([*seen, [value for _, value in self._whole.attributes]]).astype(
+                np.float32
+            ),
         }
 
     def render(self) -> NDArray[np.uint8]:

@@ -19,6 +19,11 @@ POSE_AXES = ("x", "y", "z", "qx", "qy", "qz", "qw")
 Quaternion = Sequence[float]
 
 
+def about_z(angle: float) -> tuple[float, float, float, float]:
+    """The quaternion of a turn by ``angle``, rad, about z."""
+    return 0.0, 0.0, math.sin(0.5 * angle), math.cos(0.5 * angle)
+
+
 def _vector(value: ArrayLike, size: int, what: str) -> NDArray[np.float64]:
     array = np.array(value, dtype=np.float64)
     if array.shape != (size,) or not np.isfinite(array).all():
@@ -27,7 +32,8 @@ def _vector(value: ArrayLike, size: int, what: str) -> NDArray[np.float64]:
     return array
 
 
-def _multiply(a: Quaternion, b: Quaternion) -> tuple[float, float, float, float]:
+def quaternion_product(a: Quaternion, b: Quaternion) -> tuple[float, float, float, float]:
+    """x, y, z and w of a b."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (
@@ -75,7 +81,7 @@ class Pose:
         """Compose: ``world_T_a @ a_T_b`` is ``world_T_b``."""
         rotation = self.quaternion.tolist()
         offset = np.array(_rotate(rotation, other.position.tolist()))
-        return Pose(self.position + offset, _multiply(rotation, other.quaternion.tolist()))
+        return Pose(self.position + offset, quaternion_product(rotation, other.quaternion.tolist()))
 
     def inverse(self) -> Pose:
         x, y, z, w = self.quaternion.tolist()
@@ -100,6 +106,12 @@ class Pose:
                 (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
             )
         )
+
+    @property
+    def heading(self) -> float:
+        """Angle of this frame's x axis about the parent's z axis, rad."""
+        axis = self.rotation_matrix()[:, 0]
+        return math.atan2(axis[1], axis[0])
 
     def as_vector(self) -> NDArray[np.float64]:
         """(7,): x, y, z, qx, qy, qz, qw."""
