@@ -1,6 +1,7 @@
-"""What every scene has: the bench in front of the robot, its top at z = 0."""
+"""What every scene has: the bench in front of the robot, its top at z = 0; and the motors of the robot that may stop."""
 
 from hdril.simulation.bodies import BodySpec, Box
+from hdril.simulation.robots.spec import SIDES
 from hdril.tasks.task import fixed
 
 BENCH_HEIGHT = 0.23
@@ -12,3 +13,6 @@ BENCH = BodySpec(
     anchored=False,
 )
 BENCH_PLACEMENT = fixed((0.82, 0.0, 0.0))
+
+ARM_JOINTS = tuple(f"{side}_{joint}" for side in SIDES for joint in ("s1", "e1", "w1"))
+"""One joint each of shoulder, elbow and wrist."""

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hdril.geometry import Pose
+from hdril.geometry import Pose, about_z
 from hdril.simulation.actions import HandCommand
 from hdril.simulation.bodies import BodySpec, Box
-from hdril.simulation.robots.spec import SIDES
+from hdril.simulation.robots.spec import OTHER, SIGN
 from hdril.simulation.world import ROBOT, World
 from hdril.tasks import table_lift
 from hdril.tasks.bench import BENCH
@@ -49,9 +49,6 @@ FARTHEST = 0.98
 """The canister stands no further away, x, m: beyond it no hand reaches down to it."""
 
 GREEN, DARK = (0.36, 0.55, 0.40, 1.0), (0.20, 0.30, 0.24, 1.0)
-SIGN = dict(zip(SIDES, (1.0, -1.0), strict=True))
-"""Of the y axis, on the side of a hand."""
-OTHER = dict(zip(SIDES, reversed(SIDES), strict=True))
 
 FACTORS = (
     Factor("box_yaw", "offset", 15.0, 30.0, "deg", "the canister's heading, beside the nominal 15 deg"),
@@ -99,9 +96,8 @@ class InTheWayOrAside(Uniform):
             (_ON_PLATFORM_X, _ON_PLATFORM_Y, PLATFORM_HEIGHT),
             (_ON_TABLE_X, (0.0, _ON_TABLE_Y), TOP),
         )[case]
-        half = 0.5 * (self.yaw + (2.0 * turn - 1.0) * _YAW)
         position = (x[0] + along * (x[1] - x[0]), sign * (y[0] + across * (y[1] - y[0])), z)
-        return Pose(position, (0.0, 0.0, math.sin(half), math.cos(half)))
+        return Pose(position, about_z(self.yaw + (2.0 * turn - 1.0) * _YAW))
 
 
 def _distance_from_board(point: NDArray[np.float64], table: Pose, values: Values) -> float:

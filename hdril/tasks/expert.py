@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hdril.actor import Decision, Explanation, Observation
 from hdril.geometry import POSE_AXES, Pose
 from hdril.simulation.actions import split_action
-from hdril.tasks.primitives import Hands, Noise, Plan, Primitive, Scene
+from hdril.tasks.primitives import HINDERED, Hands, Noise, Plan, Primitive, Scene
 from hdril.tasks.task import Task
 
 PATIENCE = 2
@@ -124,15 +124,11 @@ class ScriptedExpert:
         )
 
 
-ASTRAY = 0.03
-"""A hand that is further than this, m, from where it was told to be has been hindered."""
-
-
 def _as_measured(scene: Scene) -> Scene:
     """The scene, in which a hand that is not where it was told to be was told to be where it is."""
     hands = {
         side: replace(hand, pose=scene.measured[side].pose)
-        if np.linalg.norm(hand.pose.position - scene.measured[side].pose.position) > ASTRAY
+        if np.linalg.norm(hand.pose.position - scene.measured[side].pose.position) > HINDERED
         else hand
         for side, hand in scene.hands.items()
     }

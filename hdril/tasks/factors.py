@@ -39,7 +39,7 @@ class Factor:
     span: float
     """The range at the levels ``varied`` and ``hard``, in ``unit``."""
     limit: float
-    """The widest range that the robot can deal with."""
+    """The widest range that is accepted."""
     unit: str
     meaning: str
     """What varies, in words."""

@@ -32,9 +32,8 @@ def distance(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
 
 
 def _normals(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit vectors (m, 2) that contain the normals of all edges: those of every pair of points."""
-    i, j = np.triu_indices(len(points), 1)
-    edges = points[j] - points[i]
+    """Unit vectors (m, 2): the normals of the edges of a :func:`footprint`, along its box's x, y and z."""
+    edges = points[[4, 2, 1]] - points[0]
     lengths = np.linalg.norm(edges, axis=1)
     edges = edges[lengths > 1e-9] / lengths[lengths > 1e-9, None]
     return np.stack([-edges[:, 1], edges[:, 0]], axis=1)

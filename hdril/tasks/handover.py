@@ -12,11 +12,11 @@ from functools import partial
 
 import numpy as np
 
-from hdril.geometry import Pose
+from hdril.geometry import Pose, about_z
 from hdril.simulation.bodies import BodySpec, Box
 from hdril.simulation.robots.spec import SIDES
 from hdril.simulation.world import ROBOT, World
-from hdril.tasks.bench import BENCH, BENCH_PLACEMENT
+from hdril.tasks.bench import ARM_JOINTS, BENCH, BENCH_PLACEMENT
 from hdril.tasks.conditions import Condition, Stage, at_rest, not_touching, touching
 from hdril.tasks.events import EventSpec
 from hdril.tasks.factors import Factor
@@ -59,8 +59,6 @@ FACTORS = (
     Factor("rack", "offset", 0.10, 0.12, "m", "where the rack stands", ("x", "y")),
     Factor("rack_height", "offset", 0.04, 0.05, "m", "how high the rack is"),
 )
-
-ARM_JOINTS = tuple(f"{side}_{joint}" for side in SIDES for joint in ("s1", "e1", "w1"))
 EVENTS = (
     EventSpec("push", "push", (1, 11), ("bar",), strength=(0.05, 0.15)),
     EventSpec("push_held", "push", (18, 56), ("bar",), strength=(0.05, 0.15)),
@@ -91,8 +89,7 @@ class EitherSide(Uniform):
     def sample(self, rng: np.random.Generator) -> Pose:
         sign = rng.choice((-1.0, 1.0))
         x, y = rng.uniform(self.low[0], self.high[0]), rng.uniform(self.near, self.high[1])
-        half = 0.5 * (self.yaw + rng.uniform(-self.spread, self.spread))
-        return Pose((x, sign * y, self.low[2]), (0.0, 0.0, sign * math.sin(half), math.cos(half)))
+        return Pose((x, sign * y, self.low[2]), about_z(sign * (self.yaw + rng.uniform(-self.spread, self.spread))))
 
 
 def _either_side(
@@ -155,8 +152,7 @@ def _lead_in(x: float, z: float, width: float) -> Box:
 
 def _turned(box: Box, quarter: int) -> Box:
     """The box, turned by quarters of a turn about the rack's z axis."""
-    half = quarter * math.pi / 4
-    pose = Pose((0.0, 0.0, 0.0), (0.0, 0.0, math.sin(half), math.cos(half))) @ Pose(box.centre, box.quaternion)
+    pose = Pose((0.0, 0.0, 0.0), about_z(quarter * math.pi / 2)) @ Pose(box.centre, box.quaternion)
     (x, y, z), (a, b, c, d) = pose.position.tolist(), pose.quaternion.tolist()
     return replace(box, centre=(x, y, z), quaternion=(a, b, c, d))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,6 +24,7 @@ from hdril.tasks.half_tables import (
     gap_between,
 )
 from hdril.tasks.primitives import (
+    HINDERED,
     Grip,
     Grips,
     Hands,
@@ -45,8 +45,6 @@ from hdril.tasks.primitives import (
 APART = 0.0575  # of an aligned half's face from y = 0: the tip of the peg is 1.5 cm before the hole
 ABOVE = 0.12
 """How high hands travel over the grips, m."""
-HINDERED = 0.03
-"""A hand that is further than this, m, from where it was told to be has been hindered."""
 
 
 # ---------------------------------------------------------------------- grips
@@ -80,7 +78,7 @@ def grip_on(half: str, side: str, y: float) -> Grip:
     def pose(scene: Scene) -> Pose:
         body, handle = scene.objects[half], Pose((0.0, y * HANDLE_Y * _length(scene, half) / WIDTH, GRIP_HEIGHT))
         at = (body @ handle).position
-        pitch, turn = _turned(at[0], mirror * at[1], mirror * math.degrees(_heading(body)))
+        pitch, turn = _turned(at[0], mirror * at[1], mirror * math.degrees(body.heading))
         return Pose(
             handle.position, (Rotation.from_euler("z", mirror * turn, degrees=True) * _pitched(pitch)).as_quat()
         )
@@ -109,12 +107,6 @@ def widths_of(scene: Scene) -> tuple[float, float]:
     return _length(scene, LEFT), _length(scene, RIGHT)
 
 
-def _heading(pose: Pose) -> float:
-    """Angle of a body's x axis about z, rad."""
-    axis = pose.rotation_matrix()[:, 0]
-    return math.atan2(axis[1], axis[0])
-
-
 def _aligned_y(scene: Scene, half: str) -> float:
     """Where the middle of a half stands, y, m, before the two are joined."""
     return SIGN[half] * (_length(scene, half) / 2 + APART)
@@ -123,14 +115,14 @@ def _aligned_y(scene: Scene, half: str) -> float:
 def _stands_aligned(scene: Scene, half: str, distance: float, degrees: float) -> bool:
     pose = scene.objects[half]
     near = abs(pose.position[1] - _aligned_y(scene, half)) < distance
-    return bool(near and abs(_heading(pose)) < math.radians(degrees) and abs(pose.position[2]) < 0.02)
+    return bool(near and abs(pose.heading) < math.radians(degrees) and abs(pose.position[2]) < 0.02)
 
 
 def _face_each_other(scene: Scene, distance: float, degrees: float) -> bool:
     """Whether the halves stand opposite each other, up to a distance along x and an angle, ready to be joined or joined."""
     left, right = scene.objects[LEFT], scene.objects[RIGHT]
     x, _, z = (left.inverse() @ right).position
-    turn = math.degrees(_heading(right) - _heading(left))
+    turn = math.degrees(right.heading - left.heading)
     near = -0.01 < gap_between(left, right, widths_of(scene)) < 2 * APART + 0.03
     return bool(near and abs(x) < distance and abs(turn) < degrees and abs(z) < 0.02)
 
@@ -284,29 +276,15 @@ def _connect(frames: int) -> Primitive:
     return Primitive("connect", (Segment(3, square, jitter=0.0), Segment(frames - 3, press, jitter=0.0)))
 
 
-@dataclass(frozen=True)
-class _Release(Primitive):
-    """Open the hands and raise them. It can be begun at any time; what it needs is looked at while it goes on."""
-
-    def possible(self, scene: Scene) -> bool:
-        return True
-
-
 def _release(name: str, frames: int) -> Primitive:
+    """Open the hands and raise them. It can be begun at any time; what it needs is looked at while it goes on."""
     rise = Segment(frames - 2, _opened(GRIP_HEIGHT + ABOVE), jitter=0.25)
-    return _Release(name, (Segment(2, _opened(), jitter=0.0), rise), (STRAIGHT,), HIGH)
-
-
-@dataclass(frozen=True)
-class _FromAbove(Primitive):
-    """A primitive that begins with both hands over all handles: from beside a half they would knock it over."""
-
-    def possible(self, scene: Scene) -> bool:
-        return OVER_ALL.holds(scene) and super().possible(scene)
+    return Primitive(name, (Segment(2, _opened(), jitter=0.0), rise)).needing(STRAIGHT, unless=HIGH, before=())
 
 
 def _from_above(primitive: Primitive, *needs: Need, unless: Need | None = None) -> Primitive:
-    return _FromAbove(primitive.name, primitive.segments, needs, unless)
+    """A primitive that begins with both hands over all handles: from beside a half they would knock it over."""
+    return primitive.needing(*needs, unless=unless, before=(OVER_ALL, *needs))
 
 
 def _phase(half: str, targets: Targets, frames: int, *needs: Need) -> tuple[Primitive, ...]:

@@ -17,16 +17,13 @@ from scipy.spatial.transform import Rotation
 
 from hdril.geometry import Pose
 from hdril.simulation.actions import HandCommand
-from hdril.simulation.robots.spec import SIDES
+from hdril.simulation.robots.spec import OTHER, SIDES, SIGN
 from hdril.tasks.primitives import Hands, Need, Primitive, Scene, Segment
 
 Vector = NDArray[np.float64]
 Goal = Callable[[Scene], Hands]
 
 X, Y, Z = np.eye(3)
-SIGN = dict(zip(SIDES, (1.0, -1.0), strict=True))
-"""Of the y axis, on the side of a hand."""
-OTHER = dict(zip(SIDES, reversed(SIDES), strict=True))
 
 THICKNESS = 0.03
 """Of the bar, m; the jaws open to 4.8 cm or more."""

@@ -15,7 +15,7 @@ from functools import partial
 from hdril.geometry import Pose
 from hdril.simulation.robots.spec import SIDES
 from hdril.simulation.world import Physics, World
-from hdril.tasks.bench import BENCH, BENCH_PLACEMENT
+from hdril.tasks.bench import ARM_JOINTS, BENCH, BENCH_PLACEMENT
 from hdril.tasks.conditions import Condition, Measure, Stage, lies_at, raised, upright
 from hdril.tasks.events import EventSpec
 from hdril.tasks.factors import Factor
@@ -45,7 +45,6 @@ FACTORS = (
     Factor("friction", "scale", 0.4, 0.6, "", "friction of the halves on bench, pads and each other"),
     Factor("hole", "scale", 0.4, 0.6, "", "how much wider than the peg the hole is"),
 )  # fmt: skip
-ARM_JOINTS = tuple(f"{side}_{joint}" for side in SIDES for joint in ("s1", "e1", "w1"))
 EVENTS = (
     EventSpec("push", "push", (1, 18), HALVES, strength=(0.4, 1.25)),
     EventSpec("push_held", "push", (20, 124), HALVES, strength=(0.4, 1.25)),

@@ -77,25 +77,27 @@ class Segment:
 class Primitive:
     """A label and the segments that make its waypoints.
 
-    The expert plays it only while all ``needs`` hold, and passes over it where ``unless`` holds.
+    The expert plays it only while all ``needs`` hold, and passes over it where ``unless`` holds. Where it begins, ``before`` must
+    hold: the same as ``needs`` unless given.
     """
 
     name: str
     segments: tuple[Segment, ...]
     needs: tuple[Need, ...] = ()
     unless: Need | None = None
+    before: tuple[Need, ...] | None = None
 
     @property
     def frames(self) -> int:
         return sum(segment.frames for segment in self.segments)
 
-    def needing(self, *needs: Need, unless: Need | None = None) -> Primitive:
+    def needing(self, *needs: Need, unless: Need | None = None, before: tuple[Need, ...] | None = None) -> Primitive:
         """This primitive with these needs."""
-        return replace(self, needs=needs, unless=unless)
+        return replace(self, needs=needs, unless=unless, before=before)
 
     def possible(self, scene: Scene) -> bool:
-        """Whether all needs hold."""
-        return all(need.holds(scene) for need in self.needs)
+        """Whether it can begin."""
+        return all(need.holds(scene) for need in (self.needs if self.before is None else self.before))
 
     def superfluous(self, scene: Scene) -> bool:
         """Whether what it is for has been done."""
@@ -169,17 +171,16 @@ class Plan:
         """Plan the rest anew if an object that is followed has moved."""
         if self.over:
             return
-        segment, _ = self._locate(self._frame)
-        moved = {name: scene.objects[name] for name in segment.follows if _moved(self._scene, scene, name)}
+        follows = self._segment_at(self._frame).follows
+        moved = {name: scene.objects[name] for name in follows if _moved(self._scene, scene, name)}
         if moved:
             self._scene = replace(self._scene, objects=self._scene.objects | moved)
             self._plan()
 
-    def _locate(self, frame: int) -> tuple[Segment, int]:
-        """The segment of a frame, and the frame's place in it."""
+    def _segment_at(self, frame: int) -> Segment:
         for segment in self.primitive.segments:
             if frame < segment.frames:
-                return segment, frame
+                return segment
             frame -= segment.frames
         raise IndexError("the primitive is over")
 
@@ -210,12 +211,6 @@ def _moved(before: Scene, now: Scene, name: str) -> bool:
     a, b = before.objects[name], now.objects[name]
     far = float(np.linalg.norm(a.position - b.position)) > FOLLOW_DISTANCE
     return far or float(geodesic_distance(a.quaternion, b.quaternion)) > FOLLOW_ANGLE
-
-
-def plan(primitive: Primitive, scene: Scene, noise: Noise, rng: np.random.Generator) -> NDArray[np.float64]:
-    """All waypoints (frames, 16) of a primitive from ``scene``, if nothing moves that it follows."""
-    whole = Plan(primitive, scene, noise, rng)
-    return np.stack([whole.next() for _ in range(primitive.frames)])
 
 
 # ---------------------------------------------------------------------- goals
@@ -258,6 +253,8 @@ def _bodies(grips: Grips) -> tuple[str, ...]:
 # ---------------------------------------------------------------------- needs
 
 
+HINDERED = 0.03
+"""A hand that is further than this, m, from where it was told to be has been hindered."""
 WIDEST = 0.9
 """A hand that is told to close and stays open further than this (0 to 1) has not closed."""
 

@@ -12,12 +12,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdril.geometry import Pose
+from hdril.geometry import Pose, about_z
 from hdril.simulation.actions import HandCommand
 from hdril.simulation.bodies import BodySpec, Box
-from hdril.simulation.robots.spec import SIDES
+from hdril.simulation.robots.spec import SIDES, SIGN
 from hdril.simulation.world import ROBOT
-from hdril.tasks.bench import BENCH, BENCH_PLACEMENT
+from hdril.tasks.bench import ARM_JOINTS, BENCH, BENCH_PLACEMENT
 from hdril.tasks.conditions import at_height, at_rest, not_touching, touching, upright
 from hdril.tasks.events import EventSpec
 from hdril.tasks.factors import Factor
@@ -58,7 +58,6 @@ FACTORS = (
     Factor("platform", "offset", 0.10, 0.15, "m", "where the platform stands", ("x", "y")),
     Factor("platform_height", "offset", 0.04, 0.06, "m", "how high the platform is"),
 )  # fmt: skip
-ARM_JOINTS = tuple(f"{side}_{joint}" for side in SIDES for joint in ("s1", "e1", "w1"))
 EVENTS = (
     EventSpec("push", "push", (1, 9), ("table",), strength=(0.4, 1.25)),
     EventSpec("push_held", "push", (24, 48), ("table",), strength=(0.4, 1.25)),
@@ -139,22 +138,21 @@ def _grip(sign: float) -> Grip:
 
     def pose(scene: Scene) -> Pose:
         table, y = scene.objects["table"], sign * HANDLE_Y * (scene.attributes["table.length"] / WIDTH)
-        forwards = table.rotation_matrix()[:, 0]
-        yaw = sign * math.degrees(math.atan2(forwards[1], forwards[0]))
+        yaw = sign * math.degrees(table.heading)
         aside = sign * (table @ Pose((0.0, y, GRIP_HEIGHT))).position[1]
         near = 30.0 * _ramp(yaw, 3.0, 10.0) + 5.0 * _ramp(yaw, 18.0, 28.0)
         away = _ramp(-yaw, 6.0, 11.0) * _ramp(aside, 0.36, 0.44)
         nearer = max(0.02 * away, 0.02 * _far(scene))
         grip = Pose((-nearer, y, GRIP_HEIGHT), _PITCH)
         if away:
-            half = 0.5 * sign * math.radians(20.0 * away)
-            grip = Pose(grip.position, (Pose((0, 0, 0), (0.0, 0.0, math.sin(half), math.cos(half))) @ grip).quaternion)
+            outwards = Pose((0, 0, 0), about_z(sign * math.radians(20.0 * away)))
+            grip = Pose(grip.position, (outwards @ grip).quaternion)
         return grip @ _turned(near + 13.0 * away) if near or away else grip
 
     return Grip("table", pose)
 
 
-GRIPS = {side: _grip(sign) for side, sign in zip(SIDES, (1.0, -1.0), strict=True)}
+GRIPS = {side: _grip(sign) for side, sign in SIGN.items()}
 HELD = holding(GRIPS)
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from gymnasium.utils.seeding import np_random
 
-from hdril.geometry import POSE_AXES, Pose
+from hdril.geometry import POSE_AXES, Pose, about_z
 from hdril.simulation.bodies import BodySpec
 from hdril.simulation.robots.spec import SIDES
 from hdril.simulation.sensor import SensorSpec
@@ -39,8 +39,7 @@ class Uniform:
         return Pose(0.5 * (np.array(self.low) + np.array(self.high)))
 
     def sample(self, rng: np.random.Generator) -> Pose:
-        half = 0.5 * self.yaw
-        return Pose(rng.uniform(self.low, self.high), (0.0, 0.0, math.sin(half), math.cos(half)))
+        return Pose(rng.uniform(self.low, self.high), about_z(self.yaw))
 
 
 def gym_id(task: str) -> str:
@@ -59,9 +58,6 @@ class Variation:
     spans: dict[str, float] = field(default_factory=dict)
     rates: dict[str, float] = field(default_factory=dict)
     any_event: float = 0.0
-
-    def __bool__(self) -> bool:
-        return bool(self.spans or self.rates or self.any_event)
 
     @property
     def disturbed(self) -> bool:
@@ -135,6 +131,12 @@ class Task:
                 raise ValueError(f"task {self.name}: no body {name!r}; bodies: {', '.join(names)}")
         if missing := set(names) - set(self.placements):
             raise ValueError(f"task {self.name}: no placement for {', '.join(sorted(missing))}")
+        for primitive in self.recovery:
+            if primitive.name not in self.labels:
+                raise ValueError(
+                    f"task {self.name}: {primitive.name!r} in recovery is none of the primitives; "
+                    f"primitives: {', '.join(self.labels)}"
+                )
 
     @property
     def gym_id(self) -> str:
@@ -205,11 +207,19 @@ class Task:
         return tuple(sorted(events, key=lambda event: event.frame))
 
     def at(self, values: Values) -> Task:
-        """The task as it is for these values of its factors."""
+        """The task as it is for these values of its factors.
+
+        Raises:
+            ValueError: ``vary`` makes the scenes of another task, from which this one was copied.
+        """
         own = {key: value for key, value in values.items() if key.partition(":")[0] in {f.name for f in self.factors}}
         if not own or self.vary is None:
             return self
         scene = self.vary(own)
+        if scene.name.partition(":")[0] != self.name.partition(":")[0]:
+            raise ValueError(
+                f"task {self.name}: its vary makes scenes of {scene.name}; give it one of its own, or factors=()"
+            )
         return replace(scene, name=self.name, variation=self.variation, detailed=self.detailed)
 
     @staticmethod

@@ -146,6 +146,17 @@ def test_it_goes_back_to_the_last_primitive_that_is_possible() -> None:
     assert stage.labels(1) == [("c", True)]
 
 
+def test_what_is_needed_to_begin_may_differ_from_what_is_needed_to_go_on() -> None:
+    begun = stay("b", 3).needing(x_above(0.5), before=(x_above(0.7),))
+    stage = Stage(script(stay("a", 2), begun))
+    assert stage.labels(3) == [("a", True), ("a", False), ("a", True)]  # x is 0.6
+    stage.table = Pose((0.8, 0.0, 0.0))
+    stage.labels(1)
+    assert stage.labels(1) == [("b", True)]
+    stage.table = Pose((0.6, 0.0, 0.0))
+    assert stage.labels(2) == [("b", False)] * 2
+
+
 def test_nothing_that_can_be_done_ends_the_episode() -> None:
     stage = Stage(script(stay("a", 2).needing(x_above(0.5))))
     stage.table = Pose((0.4, 0.0, 0.0))

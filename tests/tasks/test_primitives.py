@@ -15,6 +15,7 @@ from hdril.tasks.primitives import (
     Grip,
     Hands,
     Noise,
+    Plan,
     Primitive,
     Scene,
     Segment,
@@ -30,10 +31,10 @@ from hdril.tasks.primitives import (
     lower,
     move,
     place,
-    plan,
     reach,
     retract,
 )
+from tests.tasks.waypoints import waypoints as planned
 
 QUIET = Noise(0.0)
 DOWN = (0.0, 1.0, 0.0, 0.0)  # tool z points down
@@ -54,7 +55,7 @@ def same(a: Pose, b: Pose) -> None:
 
 
 def waypoints(primitive: Primitive, scene: Scene = SCENE, noise: Noise = QUIET, seed: int = 0) -> np.ndarray:
-    return plan(primitive, scene, noise, np.random.default_rng(seed))
+    return planned(primitive, scene, noise, seed)
 
 
 def after(primitive: Primitive, scene: Scene = SCENE) -> Hands:
@@ -174,7 +175,7 @@ def test_noise_draws_numbers_whatever_its_size() -> None:
     states = []
     for noise in (QUIET, Noise(0.01)):
         rng = np.random.default_rng(4)
-        plan(lift("table", 0.2), SCENE, noise, rng)
+        Plan(lift("table", 0.2), SCENE, noise, rng)
         states.append(rng.bit_generator.state)
     assert states[0] == states[1]
 

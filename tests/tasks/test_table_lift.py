@@ -13,7 +13,7 @@ from hdril.geometry import Pose
 from hdril.simulation.actions import HandCommand
 from hdril.simulation.robots import SIDES
 from hdril.tasks import get_task
-from hdril.tasks.primitives import Noise, Scene, plan
+from hdril.tasks.primitives import Scene
 from hdril.tasks.table_lift import (
     GRIPS,
     HANDLE_Y,
@@ -28,6 +28,7 @@ from hdril.tasks.table_lift import (
     goal_x,
     goal_y,
 )
+from tests.tasks.waypoints import waypoints
 
 SIGNS = dict(zip(SIDES, (1.0, -1.0), strict=True))
 
@@ -110,7 +111,7 @@ def test_hands_turn_in_their_grips_while_the_table_stands() -> None:
     """At the end of ``move`` both hands are pitched to carry the table, wherever they gripped it, and where its handles are."""
     start, move = scene(yaw=25.0, at=(0.5, 0.2, 0.0)), TASK.primitives[1]
     assert max(pitch(hand.pose) for hand in start.hands.values()) > 70.0
-    last = plan(move, start, Noise(0.0), np.random.default_rng(0))[-1].reshape(2, 8)
+    last = waypoints(move, start)[-1].reshape(2, 8)
     for side, vector in zip(SIDES, last, strict=True):
         hand = Pose.from_vector(vector[:7])
         assert pitch(hand) == pytest.approx(45.0, abs=0.01)
@@ -155,7 +156,7 @@ def test_a_table_is_over_the_platform_if_its_legs_are(offset: tuple[float, float
 
 
 def _after(primitive: int, before: Scene) -> dict[str, HandCommand]:
-    rows = plan(TASK.primitives[primitive], before, Noise(0.0), np.random.default_rng(0))
+    rows = waypoints(TASK.primitives[primitive], before)
     halfway = rows[len(rows) // 2].reshape(2, 8)
     return {side: HandCommand(Pose.from_vector(row[:7]), row[7]) for side, row in zip(SIDES, halfway, strict=True)}
 
