@@ -26,6 +26,8 @@ from hdril.tasks.scenario import Scenario
 from hdril.tasks.task import Task
 
 SETTLE_PERIODS = 2
+START_CLEARANCE = 0.01
+"""Least distance, m, between the robot and an object, where the arms do not start in their usual posture."""
 FALLEN = -0.15
 """Height, m, below the bench's top, of an object that has fallen off."""
 
@@ -136,7 +138,7 @@ class BimanualEnv(gym.Env):
         self.task_spec = self._declared.at(scenario.values)
         self._whole = replace(self.task_spec, detailed=True)
         self._world = self._new_world()
-        self.controller.start(self._world, self._posture_offsets())
+        self._start_arms(self._world)
         self.controller.hold(SETTLE_PERIODS * self._physics.substeps)
         self._sensor = Sensor(self.task_spec.sensor(scenario.values), scenario.seed)
         self._disturbances = Disturbances(self._world, self.controller, self._sensor)
@@ -145,12 +147,24 @@ class BimanualEnv(gym.Env):
         self._held = 0
         return self._observe(), {"is_success": False, "events": ""} | self._progress(success=False)
 
-    def _posture_offsets(self) -> dict[str, float]:
-        """Offsets of the arm joints from their posture, rad, by joint."""
+    def _start_arms(self, world: World) -> None:
+        """Put the arms in their posture, each joint off it by a random angle where that varies.
+
+        Raises:
+            RuntimeError: in each of 100 postures a hand is at an object.
+        """
         largest = self.scenario.values.get(POSTURE.name, 0.0)
-        joints = [joint for arm in self.robot_spec.arms.values() for joint in arm.joints] if largest else []
+        if not largest:
+            self.controller.start(world)
+            return
         rng = stream(self.scenario.seed, POSTURE.name)
-        return {joint: float(rng.uniform(-largest, largest)) for joint in joints}
+        joints = [joint for arm in self.robot_spec.arms.values() for joint in arm.joints]
+        objects = [body.name for body in self.task_spec.bodies if body.mass > 0.0]
+        for _ in range(100):
+            self.controller.start(world, {joint: float(rng.uniform(-largest, largest)) for joint in joints})
+            if not any(world.near(ROBOT, name, START_CLEARANCE) for name in objects):
+                return
+        raise RuntimeError(f"{self.task}: in the scene of seed {self.scenario.seed} the arms find no room")
 
     def step(
         self, action: NDArray[np.floating]

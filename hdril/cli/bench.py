@@ -80,7 +80,7 @@ def bench_scenes(task: str, episodes: int) -> Figure:
     """Share of the expert's episodes at the level ``hard`` that sampling, the sensor and the events take; one core."""
     parts = [
         (Task, "sample"), (Task, "at"), (Sensor, "__init__"), (Sensor, "observe"), (World, "_disturb"),
-        (BimanualEnv, "_begin_events"), (BimanualEnv, "_posture_offsets"),
+        (BimanualEnv, "_begin_events"), (BimanualEnv, "_start_arms"),
     ]  # fmt: skip
     env = BimanualEnv(f"{base_name(task)}:level=hard")
     expert, seconds = ScriptedExpert(env.task_spec), 0.0

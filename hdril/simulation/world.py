@@ -94,6 +94,7 @@ class World:
             raise RuntimeError("PyBullet gave no physics client; too many worlds are open in this process")
         self._ids: dict[str, int] = {}
         self._body_frames: dict[str, Pose] = {}  # of bodies made of boxes, in their inertial frames
+        self._placed: dict[str, Pose] = {}
         self._immovable: set[str] = set()
         self._joints: dict[str, dict[str, int]] = {}
         self._links: dict[str, dict[str, int]] = {}
@@ -165,6 +166,7 @@ class World:
             self._immovable.add(spec.name)
         self._register(spec.name, body, spec.name)
         self._body_frames[spec.name] = inertial.inverse()
+        self._placed[spec.name] = pose
 
     def set_link_dynamics(self, body: str, links: Sequence[str], **dynamics: Any) -> None:
         """Forward ``dynamics`` (``lateralFriction``, ``frictionAnchor``, …) to the named links."""
@@ -302,6 +304,10 @@ class World:
         position, quaternion = self._call("getBasePositionAndOrientation", self._id(body))
         return Pose(position, quaternion) @ self._body_frames[body]
 
+    def placed(self, body: str) -> Pose:
+        """Where a body made of boxes was put before the episode began."""
+        return self._placed[self._name(body)]
+
     def velocity(self, body: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Linear (3,), m/s, of the centre of mass, and angular (3,), rad/s."""
         linear, angular = self._call("getBaseVelocity", self._id(body))
@@ -316,6 +322,10 @@ class World:
             for point in points
             if point[8] <= 0.0  # a positive distance is a contact that is near, but not made
         ]
+
+    def near(self, body_a: str, body_b: str, distance: float) -> bool:
+        """Whether some points of the two bodies are no further than ``distance``, m, from each other."""
+        return bool(self._call("getClosestPoints", self._id(body_a), self._id(body_b), distance))
 
     def state_vector(self) -> NDArray[np.float64]:
         """Poses of all bodies, positions and velocities of all joints, in one vector, to compare two runs bit for bit."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hdril.geometry import Pose, about_z
+from hdril.geometry import Pose, about_z, geodesic_distance
 from hdril.simulation.actions import HandCommand
 from hdril.simulation.bodies import BodySpec, Box
 from hdril.simulation.robots.spec import OTHER, SIGN
@@ -71,7 +71,7 @@ def _box(values: Values) -> BodySpec:
 
 
 _YAW = math.radians(15.0)
-_ASIDE_X, _ASIDE_Y = (0.45, 0.60), (0.80, 0.88)
+_ASIDE_X, _ASIDE_Y = (0.45, 0.56), (0.78, 0.86)
 _ON_PLATFORM_X = (PLATFORM_X - PLATFORM_DEPTH / 2 + 0.05, PLATFORM_X - PLATFORM_DEPTH / 2 + 0.13)
 _ON_PLATFORM_Y = (0.05, 0.38)
 _ON_TABLE_X, _ON_TABLE_Y = (0.0, 0.10), 0.25
@@ -158,7 +158,15 @@ def _left_alone(world: World) -> bool:
     return bool(world.contacts("box", BENCH.name)) and not any(world.contacts("box", other) for other in others)
 
 
+def _where_it_stood(world: World) -> bool:
+    """Whether a canister that stood aside from the beginning is there still: within 1 cm and 0.1 rad."""
+    before, now = world.placed("box"), world.pose("box")
+    near = np.linalg.norm(now.position - before.position) < 0.01
+    return bool(before.position[2] > 0.0 or (near and geodesic_distance(now.quaternion, before.quaternion) < 0.1))
+
+
 BOX_ASIDE = Condition("box on bench, free of all else", _left_alone)
+BOX_LEFT = Condition("box that stood aside left there", _where_it_stood)
 
 # ---------------------------------------------------------------------- what is seen
 
@@ -322,7 +330,7 @@ def make_scene(values: Values) -> Task:
         ),
         length=lift.horizon,
         longest=lift.horizon + PICK_AND_PUT,
-        success=(*lift.success, BOX_ASIDE),
+        success=(*lift.success, BOX_ASIDE, BOX_LEFT),
         stages=(Stage("box aside", (BOX_ASIDE,)), Stage("table raised", (raised("table", 0.05),))),
         factors=(*lift.factors, *FACTORS),
         vary=make_scene,

@@ -60,9 +60,9 @@ class Variation:
     any_event: float = 0.0
 
     @property
-    def disturbed(self) -> bool:
-        """Whether anything happens to episodes."""
-        return bool(self.rates or self.any_event)
+    def nominal(self) -> bool:
+        """Whether nothing varies and nothing happens."""
+        return not (self.spans or self.rates or self.any_event)
 
 
 NOMINAL = Variation()
@@ -71,7 +71,7 @@ Values = Mapping[str, float]
 PLACEMENTS = 50
 """Placements that are tried before other values of the factors are drawn."""
 PATIENCE = 3
-"""Horizons that an episode may take in which something may go wrong."""
+"""See :attr:`Task.budget`."""
 
 
 @dataclass(frozen=True)
@@ -171,8 +171,11 @@ class Task:
 
     @property
     def budget(self) -> int:
-        """Frames after which an episode is cut unless it is said otherwise: those of the longest plan if nothing can happen."""
-        if self.variation.disturbed:
+        """Frames after which an episode is cut unless it is said otherwise: those of the longest plan.
+
+        Where scenes vary, three times as many, because a grasp may fail there and can be tried again.
+        """
+        if not self.variation.nominal:
             return PATIENCE * (self.longest or self.horizon)
         return self.horizon if self.longest is None else self.longest + self.dwell
 

@@ -116,6 +116,20 @@ def test_a_planner_that_skips_the_step_fails(place: str, side: str) -> None:
         assert not BOX_ASIDE.holds(env.world)
 
 
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_planner_that_adds_the_step_fails(side: str) -> None:
+    """It succeeds with the table, but the canister is no longer where it stood; however long it may take."""
+    pick, put = f"pick_{side}", f"put_{side}"
+    unasked = tuple(
+        p.needing() if p.name in (pick, put) else p for p in TASK.primitives if p.name in (pick, put, *TABLE_LIFT)
+    )
+    with closing(BimanualEnv(NAME, max_episode_steps=3 * TASK.budget)) as env:
+        expert = ScriptedExpert(replace(TASK, primitives=unasked), Noise(0.0))
+        steps = list(transitions(env, expert, seed_of("bench", side)))
+        assert "box that stood aside left there" in steps[-1].info["unmet"]
+        assert BOX_ASIDE.holds(env.world)
+
+
 @pytest.mark.parametrize(
     ("turned", "expected"),
     [((0.0, 0.0, 0.0, 1.0), 0.0), ((1.0, 0.0, 0.0, 1.0), -EDGE / 2), ((1.0, 0.0, 0.0, 0.0), -0.35)],
