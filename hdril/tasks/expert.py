@@ -102,8 +102,9 @@ class ScriptedExpert:
             raise StopIteration(f"nothing can be done for {wanted}")
         self._next = again[-1] + 1
         self._queue = [script[again[-1]]]
-        if not self._queue[0].needs and self.task.recovery:
-            self._queue = [*self.task.recovery, *self._queue]
+        if not self._queue[0].needs:
+            labelled = [primitive for primitive in self.task.recovery if primitive.name in self.task.labels]
+            self._queue = [*labelled, *self._queue]
         return self._queue.pop(0), (f"back to {script[self._next - 1].name}: {wanted} is not possible",)
 
     @staticmethod

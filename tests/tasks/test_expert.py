@@ -116,6 +116,15 @@ def test_it_goes_back_where_a_primitive_is_not_possible_and_says_so() -> None:
     assert runs([("c", True), *stage.labels(8)]) == [("c", 2), ("a", 3), ("b", 2), ("c", 2)]
 
 
+def test_what_has_no_label_is_left_out_of_the_recovery() -> None:
+    """A copy of a task that has other primitives keeps the first one's recovery."""
+    task = script(stay("a", 3), stay("b", 2).needing(x_above(0.5)), recovery=(stay("wave", 2), stay("b", 1)))
+    stage = Stage(task)
+    stage.labels(2)
+    stage.table = Pose((0.4, 0.0, 0.0))
+    assert stage.labels(5) == [("a", False), ("b", True), ("a", True), ("a", False), ("a", False)]
+
+
 def test_a_primitive_is_given_up_when_a_need_is_missing_for_two_frames() -> None:
     task = script(stay("a", 2), stay("b", 6).needing(x_above(0.5)))
     stage = Stage(task)

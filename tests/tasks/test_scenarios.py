@@ -340,11 +340,3 @@ def test_a_copy_of_a_task_does_not_make_scenes_of_the_first() -> None:
         ValueError, match=r"^task my_lift:level=varied: its vary makes scenes of table_lift; give it one"
     ):
         copy.sample(0)
-
-
-def test_what_the_expert_does_to_recover_has_a_label() -> None:
-    task = get_task("table_lift")
-    with pytest.raises(
-        ValueError, match=r"^task table_lift: 'wave' in recovery is none of the primitives; primitives: grasp"
-    ):
-        replace(task, recovery=(replace(task.recovery[0], name="wave"),))
