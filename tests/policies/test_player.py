@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 from lerobot_policy_hdril import HDRILPolicy
-from lerobot_policy_hdril.player import PlaybackState, advance
+from lerobot_policy_hdril.player import Choice, PlaybackState, advance
 
 from tests.policies.tools import BATCH, FRAMES, STARTS, Training, build, observation
 
@@ -19,16 +19,17 @@ class Scripted:
     """A policy of three primitives that wants what it is told, row by row, and plans 100 k + (frame of the primitive)."""
 
     def __init__(self, wishes: list[list[int]], **config) -> None:
-        self.config = SimpleNamespace(**{"rollout": "closed_loop", "replan_every": 0} | config)
+        self.config = SimpleNamespace(**{"rollout": "closed_loop", "replan_every": 0, "filter_frames": 1} | config)
         self.shortest_length, self.longest_length = torch.tensor(SHORTEST), torch.tensor(LONGEST)
-        self.wishes, self.planned_from = iter(wishes), []
+        self.wishes, self.planned_from, self.filtered = iter(wishes), [], []
 
-    def choose(self, state, memory):
-        probabilities = torch.nn.functional.one_hot(torch.tensor(next(self.wishes)), 3).float()
-        return probabilities, torch.zeros(1, len(state), 1)
+    def choose(self, state, previous):
+        begin = torch.nn.functional.one_hot(torch.tensor(next(self.wishes)), 3).float()
+        return Choice(begin, None, torch.zeros(1, len(state), 1))
 
-    def plan(self, state, primitive, elapsed):
+    def plan(self, state, filtered, primitive, elapsed):
         self.planned_from.append((state[:, 0].tolist(), primitive.tolist(), elapsed.tolist()))
+        self.filtered.append(filtered[:, 0].tolist())
         steps = 100 * primitive[:, None] + elapsed[:, None] + torch.arange(6)
         # One action, and one number of state.
         return torch.stack([steps, steps + 0.5], dim=-1)
@@ -149,9 +150,9 @@ def test_primitives_of_varying_length_are_played_within_their_lengths(varied, mo
     assert any(low < high for low, high in lengths)
 
     # A planner that never agrees with what plays: each primitive ends at its shortest length.
-    def choose(state, memory):
-        count = 0 if memory is None else int(memory.item()) + 1
-        return torch.eye(6)[count % 2][None], torch.full((1, 1, 1), float(count))
+    def choose(state, previous):
+        count = 0 if previous is None else int(previous.memory.item()) + 1
+        return Choice(torch.eye(6)[count % 2][None], None, torch.full((1, 1, 1), float(count)))
 
     monkeypatch.setattr(policy, "choose", choose)
     runs: list[list] = []

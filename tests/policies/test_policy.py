@@ -69,6 +69,7 @@ def test_policy_explains_itself(metadata) -> None:
     assert policy.explain() is None
     with pytest.raises(RuntimeError, match="no episode is running"):
         policy.attention()
+    begun: list[set[str]] = [set(), set()]
     for t in range(25):
         action = policy.select_action(observation(metadata, [t, FRAMES + t]))
         attention = policy.attention()
@@ -87,8 +88,12 @@ def test_policy_explains_itself(metadata) -> None:
                 name: pytest.approx(float(share[row]), abs=1e-6) for name, share in received.items()
             }
             assert sum(told.attention.values()) == pytest.approx(1.0, abs=1e-5)
-            assert told.events == ()
-            if told.plan is not None:
+            if told.plan is None:
+                assert told.events == ()
+            else:
+                again = (f"{told.primitive} tried again",) if told.primitive in begun[row] else ()
+                assert told.events == again
+                begun[row].add(told.primitive)
                 longest = policy.config.primitive_lengths[policy.config.primitives.index(told.primitive)][1]
                 assert told.plan.shape == (longest, 16)
                 torch.testing.assert_close(torch.from_numpy(told.plan[0]), action[row])
@@ -106,10 +111,8 @@ def test_plan_undoes_what_the_target_did(coordinates: str, metadata, monkeypatch
     """If the dynamics predict their targets, the plan is what was recorded: in the world, metres and unit quaternions."""
     policy = build(metadata, coordinates=coordinates).eval()
     window = demonstrations(policy).window(torch.tensor([0, 25, 140]), 0, 12)
-    monkeypatch.setattr(
-        policy, "predict", lambda state, primitive, elapsed: (policy.target(window), state.new_zeros(3))
-    )
-    plan = policy.plan(window.state, window.primitive, window.elapsed)
+    monkeypatch.setattr(policy, "predict", lambda state, *_: (policy.target(window), state.new_zeros(3)))
+    plan = policy.plan(window.state, window.filtered, window.primitive, window.elapsed)
     torch.testing.assert_close(plan[window.mask], window.target[window.mask], atol=1e-4, rtol=1e-4)
 
 
@@ -127,7 +130,7 @@ def test_stacked_models_are_the_separate_ones(preset: str, metadata) -> None:
     gradients = []
     for policy in (separate.eval(), stacked.eval()):
         window = demonstrations(policy).window(rows, 4, 12)
-        predicted = policy.predict(window.state, window.primitive, window.elapsed)
+        predicted = policy.predict(window.state, window.filtered, window.primitive, window.elapsed)
         policy.dynamics_loss(window)[0].backward()
         gradients.append([*predicted, *(p.grad for p in policy.dynamics.parameters() if p.grad is not None)])
     assert len(gradients[0]) == len(gradients[1]) > 10
@@ -176,7 +179,7 @@ def test_latent_is_sampled_in_training_and_steady_afterwards(metadata) -> None:
     window = demonstrations(policy).window(rows, 0, 12)
 
     def predict() -> torch.Tensor:
-        return policy.predict(window.state, window.primitive, window.elapsed)[0]
+        return policy.predict(window.state, window.filtered, window.primitive, window.elapsed)[0]
 
     policy.train()
     assert not torch.equal(predict(), predict())
@@ -197,9 +200,9 @@ def test_prediction_is_the_mean_over_samples(metadata) -> None:
             model.latent[-1].bias[SMALL["hidden_dim"] :] = -100.0  # log variance
             torch.nn.init.normal_(model.head[-1].weight)
     window = demonstrations(policy).window(torch.tensor([0, 15]), 0, 12)
-    sampled = policy.predict(window.state, window.primitive, window.elapsed)[0]
+    sampled = policy.predict(window.state, window.filtered, window.primitive, window.elapsed)[0]
     policy.config.samples = 0
-    mean = policy.predict(window.state, window.primitive, window.elapsed)[0]
+    mean = policy.predict(window.state, window.filtered, window.primitive, window.elapsed)[0]
     torch.testing.assert_close(sampled, mean, atol=1e-4, rtol=1e-4)
 
 
@@ -211,7 +214,7 @@ def test_divergence_is_that_of_gaussians(metadata) -> None:
     model = policy.dynamics[0]
     model.latent.register_forward_hook(lambda module, args, out: kept.update(latent=out.detach()))
     window = demonstrations(policy).window(torch.tensor([0]), 0, 12)
-    _, divergence = policy.predict(window.state, window.primitive, window.elapsed)
+    _, divergence = policy.predict(window.state, window.filtered, window.primitive, window.elapsed)
     mean, log_variance = kept["latent"].chunk(2, dim=-1)
     expected = kl_divergence(Normal(mean, (0.5 * log_variance).exp()), Normal(0.0, 1.0)).sum(-1)
     torch.testing.assert_close(divergence, expected)

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from hdril.geometry import Pose
 
 SIDES: tuple[str, ...] = ("left", "right")
-OTHER = dict(zip(SIDES, reversed(SIDES), strict=True))
+OTHER: dict[str, str] = dict(zip(SIDES, reversed(SIDES), strict=True))
 """The other side."""
-SIGN = dict(zip(SIDES, (1.0, -1.0), strict=True))
+SIGN: dict[str, float] = dict(zip(SIDES, (1.0, -1.0), strict=True))
 """The sign of the y axis on each side."""
 
 

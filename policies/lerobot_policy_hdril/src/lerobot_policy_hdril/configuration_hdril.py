@@ -19,9 +19,10 @@ from lerobot_policy_hdril.schema import SUBTASK_KEY
 Interaction = Literal["none", "scalar", "object"]
 Decoder = Literal["gru", "ode"]
 Rollout = Literal["closed_loop", "open_loop"]
-Coordinates = Literal["absolute", "relational"]
+Coordinates = Literal["absolute", "relational", "fused"]
 Latent = Literal["deterministic", "variational"]
 Experts = Literal["auto", "separate", "stacked"]
+Termination = Literal["length", "learned"]
 
 
 def _check_choice(name: str, value: str, choices: Any) -> None:
@@ -48,12 +49,23 @@ class HDRILConfig(PreTrainedConfig):
     """The objects' state skips the encoder and joins its last hidden state (the paper's Res)."""
     state_skip: bool = True
     """A linear map from the state to every step of the prediction, beside the network (ours)."""
+    filter_frames: int = 1
+    """The linear maps see the mean of the last so many states beside the present one: observations are noisy. 1: no mean."""
+    robust: bool = False
+    """Leave out of the linear maps' fit what is far off it: in demonstrations of scenes where something goes wrong, some
+    windows show how that was mended."""
+    termination: Termination = "length"
+    """When a primitive is over. ``length``: after its shortest recorded length, as soon as the planner prefers another.
+    ``learned``: the planner decides at every frame whether it goes on or one begins, maybe the same again; for
+    demonstrations in which primitives are broken off and repeated."""
     per_primitive: bool = True
     """One dynamics model per primitive (the paper's Multi), or one for all that is told the primitive."""
     decoder: Decoder = "gru"
     coordinates: Coordinates = "absolute"
     """Of the dynamics. ``relational``: hands and predictions in the frame of the first object, as it stands when a plan is
-    made. The planner always sees the world's."""
+    made. ``fused``: the linear maps predict the next actions in the world's and every object's frame, and the predictions
+    are fused by their precision; needs ``replan_every``, because it plans no further than it acts. The planner always sees
+    the world's."""
     latent: Latent = "deterministic"
     """``variational``: a Gaussian, sampled in training (paper, Figure 2)."""
     kl_weight: float = 0.0
@@ -143,7 +155,8 @@ class HDRILConfig(PreTrainedConfig):
         _check_choice("coordinates", self.coordinates, Coordinates)
         _check_choice("latent", self.latent, Latent)
         _check_choice("experts", self.experts, Experts)
-        for name in ("hidden_dim", "node_dim", "planner_hidden_dim", "planner_batch_size"):
+        _check_choice("termination", self.termination, Termination)
+        for name in ("hidden_dim", "node_dim", "planner_hidden_dim", "planner_batch_size", "filter_frames"):
             if getattr(self, name) < 1:
                 raise ValueError(f"policy.{name} must be at least 1, got {getattr(self, name)}")
         if self.ridge <= 0:
@@ -157,6 +170,13 @@ class HDRILConfig(PreTrainedConfig):
         if self.experts == "stacked" and self.decoder == "ode":
             raise ValueError(
                 "policy.experts=stacked works with policy.decoder=gru: the ODE's solver cannot be batched so"
+            )
+        if self.coordinates == "fused" and not (
+            self.state_skip and self.rollout == "closed_loop" and self.replan_every
+        ):
+            raise ValueError(
+                "policy.coordinates=fused needs policy.state_skip=true, policy.rollout=closed_loop and policy.replan_every "
+                f"of at least 1; got {self.state_skip}, {self.rollout} and {self.replan_every}"
             )
         if self.replan_every < 0:
             raise ValueError(f"policy.replan_every must be 0 (never) or more frames, got {self.replan_every}")
@@ -211,6 +231,10 @@ class HDRILConfig(PreTrainedConfig):
     def check_replanning(self) -> None:
         """Raises ValueError unless the policy learned to plan from every frame at which it is to do so."""
         trained, wanted = self.trained_replan_every, self.replan_every
+        if self.coordinates == "fused" and trained not in (-1, wanted):
+            raise ValueError(
+                f"policy.replan_every must be {trained}, because the checkpoint plans so many frames; got {wanted}"
+            )
         if trained < 0 or not wanted or (trained and wanted % trained == 0):
             return
         valid = f"0 or a multiple of {trained}" if trained else "0"

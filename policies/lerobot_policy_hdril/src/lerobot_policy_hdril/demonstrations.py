@@ -31,11 +31,13 @@ if TYPE_CHECKING:
 class Window:
     """The rest of a primitive from a frame on, for B samples, padded to M frames.
 
-    ``state`` (B, S) is what is seen at the start; ``elapsed`` (B,) how many frames of the primitive are over by then;
-    ``target`` (B, M, A + S) the actions and the states that they lead to; ``mask`` (B, M) is True on real frames.
+    ``state`` (B, S) is what is seen at the start, ``filtered`` (B, S) the mean of the last states there; ``elapsed`` (B,) how
+    many frames of the primitive are over by then; ``target`` (B, M, A + S) the actions and the states that they lead to;
+    ``mask`` (B, M) is True on real frames.
     """
 
     state: Tensor
+    filtered: Tensor
     primitive: Tensor  # (B,)
     elapsed: Tensor
     target: Tensor
@@ -44,10 +46,17 @@ class Window:
 
 @dataclass(frozen=True)
 class History:
-    """Whole episodes for B samples, padded to T frames: states (B, T, S), labels (B, T), mask (B, T)."""
+    """Whole episodes for B samples, padded to T frames: states (B, T, S), and the rest (B, T).
+
+    ``begins`` is True where a primitive begins; ``playing`` is the one of the frame before, K where there is none, and
+    ``elapsed`` how many of its frames are over.
+    """
 
     state: Tensor
     primitive: Tensor
+    begins: Tensor
+    playing: Tensor
+    elapsed: Tensor
     mask: Tensor
 
 
@@ -123,7 +132,7 @@ class Demonstrations:
         ValueError: labels that are not integers from 0 to the number of primitives - 1, or a primitive with no frames.
     """
 
-    def __init__(self, metadata: LeRobotDatasetMetadata, subtask_key: str, device: str) -> None:
+    def __init__(self, metadata: LeRobotDatasetMetadata, subtask_key: str, device: str, filter_frames: int = 1) -> None:
         root = Path(metadata.root)
         self.primitives = read_primitives(root)
         columns = _read_columns(root, subtask_key)
@@ -150,6 +159,16 @@ class Demonstrations:
         self._episode_bounds = self._bounds(new_episode, device)  # (E, 2)
         self.longest = int((self._segment_bounds[:, 1] - self._segment_bounds[:, 0]).max())
         """Frames of the longest segment."""
+        self.filtered = self._filter(filter_frames)
+        """(N, S): the mean state of the last ``filter_frames`` frames of the episode, or of those there are."""
+
+    def _filter(self, frames: int) -> Tensor:
+        if frames == 1:
+            return self.state
+        sums = torch.cat([torch.zeros_like(self.state[:1]), self.state], dim=0).double().cumsum(0)
+        last = torch.arange(len(self.state), device=self.state.device)
+        first = torch.maximum(self._episode_bounds[self.episode, 0], last + 1 - frames)
+        return ((sums[last + 1] - sums[first]) / (last + 1 - first)[:, None]).to(self.state)
 
     @staticmethod
     def _bounds(starts: np.ndarray, device: str) -> Tensor:
@@ -194,7 +213,7 @@ class Demonstrations:
         # The last frame of an episode leads to a state that was not recorded: its own stands in.
         last = self._episode_bounds[self.episode[rows], 1][:, None] - 1
         target = torch.cat([self.action[steps], self.state[torch.minimum(steps + 1, last)]], dim=-1)
-        return Window(self.state[start], self.label[start], elapsed, target, mask)
+        return Window(self.state[start], self.filtered[start], self.label[start], elapsed, target, mask)
 
     def history(self, rows: Tensor) -> History:
         """The whole episodes that the frames belong to."""
@@ -202,4 +221,9 @@ class Demonstrations:
         steps = first[:, None] + torch.arange(int((end - first).max()), device=rows.device)
         mask = steps < end[:, None]
         steps = torch.minimum(steps, end[:, None] - 1)
-        return History(self.state[steps], self.label[steps], mask)
+        since = self._segment_bounds[self.segment[steps], 0]
+        begins, before = steps == since, (steps - 1).clamp_min(0)
+        fresh = steps == first[:, None]
+        playing = torch.where(fresh, len(self.primitives), self.label[before])
+        elapsed = torch.where(fresh, 0, steps - self._segment_bounds[self.segment[before], 0])
+        return History(self.state[steps], self.label[steps], begins, playing, elapsed, mask)

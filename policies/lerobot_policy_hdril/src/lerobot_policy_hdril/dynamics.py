@@ -12,6 +12,44 @@ from torch.func import functional_call
 from lerobot_policy_hdril.decoders import DECODERS, gru_step
 from lerobot_policy_hdril.interaction import make_interaction
 
+FAR = 5.0
+"""Medians of the distance from a robust fit, beyond which a demonstration is left out of it."""
+
+
+def ridge_penalty(inputs: Tensor, ridge: float) -> Tensor:
+    """The penalty (D, D) on maps of inputs (N, D), the last of which is 1: that weight is free."""
+    penalty = ridge * torch.eye(inputs.shape[1], dtype=inputs.dtype, device=inputs.device)
+    penalty[-1, -1] = 1e-6
+    return penalty
+
+
+def solve_ridge(x: Tensor, y: Tensor, penalty: Tensor) -> tuple[Tensor, Tensor]:
+    """The map (W, D) of inputs x (N, D) to outputs y (N, W), and its leave-one-out errors (N, W).
+
+    The error of a row, had the map been solved without it, is its residual over 1 - h, with h = x (X^T X + P)^-1 x^T.
+    """
+    inverse = torch.linalg.inv(x.T @ x + penalty)
+    solution = inverse @ (x.T @ y)
+    leverage = ((x @ inverse) * x).sum(1).clamp_max(0.99)
+    return solution.T, (y - x @ solution) / (1.0 - leverage)[:, None]
+
+
+def usual_windows(x: Tensor, y: Tensor, rows: Tensor, penalty: Tensor) -> Tensor:
+    """Which of the windows ``rows`` (N,) are near a robust fit of x (N, D) to y (N, W): a mask (N,).
+
+    Iteratively reweighted least squares; a window counts as far at :data:`FAR` times the median distance.
+    """
+    x, y = x[rows], y[rows]
+    weights = torch.ones_like(x[:, :1])
+    far = torch.zeros_like(weights)
+    for _ in range(3):
+        solution = torch.linalg.solve(x.T @ (weights * x) + penalty, x.T @ (weights * y))
+        far = (y - x @ solution).norm(dim=1, keepdim=True)
+        weights = (2.0 * far.median() / far.clamp_min(1e-9)).square().clamp_max(1.0)
+    near = rows.clone()
+    near[rows] = (far <= FAR * far.median().clamp_min(1e-6))[:, 0]
+    return near
+
 
 class StateSkip(nn.Module):
     """A linear map from the state to the output of each step: ours, beside the paper's skip into the latent.
@@ -34,10 +72,21 @@ class StateSkip(nn.Module):
     bias: Tensor
 
     @torch.no_grad()
-    def fit(self, normalised: Tensor, steps: Tensor, target: Tensor, mask: Tensor, ridge: float) -> None:
+    def fit(
+        self,
+        normalised: Tensor,
+        steps: Tensor,
+        target: Tensor,
+        mask: Tensor,
+        ridge: float,
+        scale: Tensor | None = None,
+    ) -> None:
         """Solve the maps, in float64: W_i minimises sum_n |W_i [s_n || 1] - y_ni|^2 + ridge |W_i|^2, the bias is free.
 
         A step without a target has the map 0.
+
+        With ``scale``, the fit is robust: windows are left out that are far off a first fit. Something went wrong at them, or
+        the teacher mended something. A few of them in a hundred move a least-squares map by centimetres.
 
         Args:
             normalised: states (N, S) at which windows start.
@@ -45,14 +94,18 @@ class StateSkip(nn.Module):
             target: normalised outputs (N, M, W).
             mask: (N, M), True where there is a target: the first frames of a row, as many as it has.
             ridge: weight of the penalty; keeps the answer small in directions that the demonstrations do not vary in.
+            scale: deviations (A,) that the first A outputs were normalised by: how far off a window is, is measured in these
+                outputs' own units, m and numbers of quaternions.
         """
         self.weight.zero_()
         self.bias.zero_()
         inputs = torch.cat([normalised, torch.ones_like(normalised[:, :1])], dim=-1).double()
-        penalty = ridge * torch.eye(inputs.shape[1], dtype=torch.float64, device=inputs.device)
-        penalty[-1, -1] = 1e-6
+        penalty = ridge_penalty(inputs, ridge)
         for first in steps[:, 0].unique().tolist():
             starts_here = steps[:, 0] == first
+            if scale is not None:
+                distance = scale * target[:, 0, : len(scale)].double()
+                starts_here = usual_windows(inputs, distance, starts_here & mask[:, 0], penalty)
             counts = (mask & starts_here[:, None]).sum(0).tolist()
             begin = 0
             for count, columns in groupby(counts):  # steps that the same rows have share their normal equations
@@ -85,10 +138,11 @@ class PrimitiveDynamics(nn.Module):
     """Graph GRU encoder with the objects' skip connection, latent, decoder (paper, Figure 2).
 
         h = GRU(graph(s_t), 0)    [m, v] = FC([h || s_t^objects || c])    z = m + exp(v / 2) * noise
-        y_i = FC([decoder_i(z) || z]) + L_i s_t
+        y_i = FC([decoder_i(z) || z]) + L_i [s_t || f_t]
 
-    ``context`` c is empty for a model of one primitive, and says which primitive it is for a model of all. L is there
-    with ``state_skip``. Without ``variational`` there is no v, and z = m.
+    f_t is the mean of the last states, with ``filtered``. ``context`` c is empty for a model of one primitive, and says which
+    primitive it is for a model of all. L is there with ``state_skip``; with ``residual``, other maps stand in for it. Without
+    ``variational`` there is no v, and z = m.
     """
 
     def __init__(
@@ -105,6 +159,8 @@ class PrimitiveDynamics(nn.Module):
         state_skip: bool,
         stride: int,
         variational: bool,
+        filtered: bool = False,
+        residual: bool = False,
     ) -> None:
         super().__init__()
         self.graph = make_interaction(interaction, names, node_dim)
@@ -119,24 +175,41 @@ class PrimitiveDynamics(nn.Module):
         self.decoder = DECODERS[decoder](hidden_dim, steps)
         first, last = nn.Linear(2 * hidden_dim, hidden_dim), nn.Linear(hidden_dim, out_dim)
         self.head = nn.Sequential(first, nn.SiLU(), last)
-        self.state_skip = StateSkip(len(names), out_dim, steps, stride) if state_skip else None
-        if state_skip:  # the network starts from what the linear maps leave: nothing
+        seen = 2 * len(names) if filtered else len(names)
+        self.state_skip = StateSkip(seen, out_dim, steps, stride) if state_skip else None
+        if state_skip or residual:  # the network starts from what the linear maps leave: nothing
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
 
     skip_columns: Tensor
 
-    def fit_state_skip(self, normalised: Tensor, steps: Tensor, target: Tensor, mask: Tensor, ridge: float) -> None:
+    def fit_state_skip(
+        self,
+        normalised: Tensor,
+        steps: Tensor,
+        target: Tensor,
+        mask: Tensor,
+        ridge: float,
+        scale: Tensor | None = None,
+    ) -> None:
         """Solve the linear maps, see :meth:`StateSkip.fit`; nothing to do without them."""
         if self.state_skip is not None:
-            self.state_skip.fit(normalised, steps, target, mask, ridge)
+            self.state_skip.fit(normalised, steps, target, mask, ridge, scale)
 
     def forward(
-        self, normalised: Tensor, raw: Tensor, context: Tensor, steps: Tensor, samples: int = 0, stacked: bool = False
+        self,
+        normalised: Tensor,
+        raw: Tensor,
+        context: Tensor,
+        steps: Tensor,
+        linear: Tensor,
+        samples: int = 0,
+        stacked: bool = False,
     ) -> tuple[Tensor, Tensor]:
         """States (B, S), context (B, C) and step numbers (B, M) to a prediction, and how far the latent is from its prior.
 
         Args:
+            linear: what the linear maps see (B, S), or (B, 2 S) if ``filtered``.
             samples: latents to draw and average over; 0 takes the mean latent. In training, one is drawn.
             stacked: called by :func:`predict_stacked` under vmap; leaves out the linear maps.
 
@@ -162,7 +235,7 @@ class PrimitiveDynamics(nn.Module):
         output = self.head(torch.cat([decoded, latent[:, None].expand_as(decoded)], dim=-1))
         output = output.unflatten(0, (copies, len(normalised))).mean(0)
         if not stacked and self.state_skip is not None:
-            output = output + self.state_skip(normalised, steps)
+            output = output + self.state_skip(linear, steps)
         return output, divergence
 
     def _noise(self, mean: Tensor, samples: int) -> Tensor:
@@ -182,6 +255,7 @@ def predict_stacked(
     raw: Tensor,
     context: Tensor,
     steps: Tensor,
+    linear: Tensor,
     which: Tensor,
     samples: int = 0,
 ) -> tuple[Tensor, Tensor]:
@@ -210,15 +284,15 @@ def predict_stacked(
 
     # "same": sampled latents outside of training are those of a model called alone.
     batched = torch.vmap(one, randomness="same")
-    output, divergence = batched(stacked, normalised[rows], raw[rows], context[rows], steps[rows])
+    output, divergence = batched(stacked, normalised[rows], raw[rows], context[rows], steps[rows], linear[rows])
     output, divergence = output[group, slot], divergence[group, slot]
     maps = {
         k: model.state_skip for k, model in zip(present.tolist(), used, strict=True) if model.state_skip is not None
     }
     if not maps:
         return output, divergence
-    linear = torch.empty_like(output)
+    mapped = torch.empty_like(output)
     for k, skip in maps.items():
         mine = (which == k).nonzero().squeeze(-1)
-        linear = linear.index_copy(0, mine, skip(normalised[mine], steps[mine]))
-    return output + linear, divergence
+        mapped = mapped.index_copy(0, mine, skip(linear[mine], steps[mine]))
+    return output + mapped, divergence

@@ -77,4 +77,12 @@ def explain(policy: HDRILPolicy, playback: PlaybackState, row: int) -> Explanati
         probabilities=dict(zip(names, playback.probabilities[row].tolist(), strict=True)),
         plan=plan,
         attention={name: float(share[0]) for name, share in attention.received().items()},
+        events=_events(names, playback, row),
     )
+
+
+def _events(names: list[str], playback: PlaybackState, row: int) -> tuple[str, ...]:
+    """A primitive that begins for the second time or later: what it was for has not come about, or was lost."""
+    playing = int(playback.primitive[row])
+    again = int(playback.elapsed[row]) == 0 and int(playback.begun[row, playing]) > 1
+    return (f"{names[playing]} tried again",) if again else ()

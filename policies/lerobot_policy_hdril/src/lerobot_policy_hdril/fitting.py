@@ -9,12 +9,13 @@ nothing that is fitted sees them, whatever wraps or copies the dataset.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import torch
 from torch import Tensor, nn
 
 from lerobot_policy_hdril.demonstrations import Demonstrations, Window
+from lerobot_policy_hdril.fusion import FusedMaps
 from lerobot_policy_hdril.provenance import Origin, TrainingData, from_runs
 
 if TYPE_CHECKING:
@@ -98,13 +99,40 @@ def fit(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Tensor) -
     with torch.autocast(demonstrations.state.device.type, enabled=False):
         policy.set_lengths(demonstrations.lengths(episodes))
         _fit_normalisation(policy, demonstrations, episodes)
-        if policy.config.state_skip:
+        if policy.fused is not None:
+            _fit_fused(policy, demonstrations, episodes)
+        elif policy.config.state_skip:
             _fit_state_skips(policy, demonstrations, episodes)
+
+
+def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Tensor) -> None:
+    """Solve the maps in every frame on all windows that training can draw."""
+    frames, maps, actions = policy.frames, policy.fused, len(policy.config.action_names)
+    assert frames is not None
+    assert maps is not None
+    seen = frames.features(demonstrations.state[episodes[demonstrations.episode]].double())
+    policy.feature_mean.copy_(seen.mean(0))
+    policy.feature_std.copy_(seen.std(0, correction=0).clamp_min(policy.config.min_std))
+    rows = demonstrations.replan_rows(policy.ahead, episodes)
+    for k in range(len(maps)):
+        window = _window(demonstrations, rows[demonstrations.label[rows] == k], policy.ahead, policy.ahead)
+        action = window.target[..., :actions]
+        cast(FusedMaps, maps[k]).fit(
+            policy.features(window.state, window.filtered),
+            torch.div(window.elapsed, policy.ahead, rounding_mode="floor"),
+            action,
+            frames.targets(action, window.state),
+            window.mask,
+            policy.config.ridge,
+            policy.config.robust,
+        )
 
 
 def _window(demonstrations: Demonstrations, rows: Tensor, stride: int, length: int) -> Window:
     window = demonstrations.window(rows, stride, length)
-    return replace(window, state=window.state.double(), target=window.target.double())
+    return replace(
+        window, state=window.state.double(), filtered=window.filtered.double(), target=window.target.double()
+    )
 
 
 def _fit_normalisation(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Tensor) -> None:
@@ -130,9 +158,10 @@ def _fit_state_skips(policy: HDRILPolicy, demonstrations: Demonstrations, episod
         mine = rows[demonstrations.label[rows] == k] if policy.config.per_primitive else rows
         window = _window(demonstrations, mine, stride, policy.capacity)
         policy.model_of(k).fit_state_skip(
-            policy.dynamics_input(window.state),
+            policy.linear_input(window.state, window.filtered),
             policy.steps(window.elapsed),
             policy.target(window),
             window.mask,
             policy.config.ridge,
+            policy.output_std[: len(policy.config.action_names)].double() if policy.config.robust else None,
         )

@@ -20,10 +20,11 @@ from lerobot_policy_hdril.demonstrations import Demonstrations, History, Window
 from lerobot_policy_hdril.dynamics import PrimitiveDynamics, predict_stacked
 from lerobot_policy_hdril.explain import Attention, Explanation, attend, explain
 from lerobot_policy_hdril.fitting import LearnedEpisodes, fit
+from lerobot_policy_hdril.fusion import FusedMaps, ObjectFrames
 from lerobot_policy_hdril.graph import quaternion_groups
 from lerobot_policy_hdril.overrides import check_overrides
 from lerobot_policy_hdril.planner import Planner
-from lerobot_policy_hdril.player import PlaybackState, advance
+from lerobot_policy_hdril.player import Choice, PlaybackState, advance
 from lerobot_policy_hdril.provenance import read_origin
 from lerobot_policy_hdril.weights import load_weights
 
@@ -70,7 +71,7 @@ class HDRILPolicy(PreTrainedPolicy):
         self._demonstrations: Demonstrations | None = None
         if dataset_meta is not None:
             config.set_dataset_feature_metadata(dataset_meta.features)
-            data = Demonstrations(dataset_meta, config.subtask_key, config.device or "cpu")
+            data = Demonstrations(dataset_meta, config.subtask_key, config.device or "cpu", config.filter_frames)
             config.learn_primitives(data.primitives, data.longest)
             config.learn_replanning()
             self._demonstrations = data
@@ -89,6 +90,8 @@ class HDRILPolicy(PreTrainedPolicy):
         config.check_replanning()
         self.capacity = config.capacity
         models = len(config.primitives) if config.per_primitive else 1
+        fused = config.coordinates == "fused"
+        self.ahead = config.trained_replan_every if fused and config.trained_replan_every > 0 else self.capacity
         self.dynamics = nn.ModuleList(
             PrimitiveDynamics(
                 names,
@@ -100,18 +103,36 @@ class HDRILPolicy(PreTrainedPolicy):
                 decoder=config.decoder,
                 hidden_dim=config.hidden_dim,
                 node_dim=config.node_dim,
-                state_skip=config.state_skip,
+                state_skip=config.state_skip and not fused,
                 stride=max(config.trained_replan_every, 0),
                 variational=config.latent == "variational",
+                filtered=config.filter_frames > 1,
+                residual=fused,
             )
             for _ in range(models)
         )
         self.planner = Planner(
-            names, len(config.primitives), config.interaction, config.planner_hidden_dim, config.node_dim
+            names,
+            len(config.primitives),
+            config.interaction,
+            config.planner_hidden_dim,
+            config.node_dim,
+            steps=self.capacity if config.termination == "learned" else 0,
         )
         self.relational = None
         if config.coordinates == "relational":
             self.relational = RelationalCoordinates(names, config.environment_names, [*config.action_names, *names])
+        self.frames = self.fused = None
+        if fused:
+            frames = self.frames = ObjectFrames(names, config.environment_names, config.action_names)
+            seen = frames.dim * (2 if config.filter_frames > 1 else 1)
+            starts = -(-self.capacity // self.ahead)
+            self.fused = nn.ModuleList(
+                FusedMaps(seen, action_dim, len(frames.frames), len(frames.hands), starts, self.ahead)
+                for _ in config.primitives
+            )
+            for key, size in (("feature_mean", frames.dim), ("feature_std", frames.dim)):
+                self.register_buffer(key, torch.ones(size))
         for key, size in (("state", state_dim), ("output", action_dim + state_dim)):
             self.register_buffer(f"{key}_mean", torch.zeros(size))
             self.register_buffer(f"{key}_std", torch.ones(size))
@@ -130,6 +151,8 @@ class HDRILPolicy(PreTrainedPolicy):
     shortest_length: Tensor
     longest_length: Tensor
     loss_weights: Tensor
+    feature_mean: Tensor
+    feature_std: Tensor
 
     @classmethod
     def from_pretrained(
@@ -195,7 +218,7 @@ class HDRILPolicy(PreTrainedPolicy):
         if self.training and torch.is_grad_enabled():
             self._learn_from(self._demonstrations, rows)
         self._check_learned()
-        window = self._demonstrations.window(rows, self.config.trained_replan_every, self.capacity)
+        window = self._demonstrations.window(rows, self.config.trained_replan_every, self.ahead)
         dynamics_loss, divergence = self.dynamics_loss(window)
         history = self._demonstrations.history(rows[: self.config.planner_batch_size])
         planner_loss, accuracy = self.planner_loss(history, window)
@@ -229,8 +252,13 @@ class HDRILPolicy(PreTrainedPolicy):
 
     def dynamics_loss(self, window: Window) -> tuple[Tensor, Tensor]:
         """Mean squared error and mean divergence of the latent, nats."""
-        predicted, divergence = self.predict(window.state, window.primitive, window.elapsed)
-        error = (predicted - self.target(window)).square() @ self.loss_weights  # (B, M)
+        predicted, divergence = self.predict(window.state, window.filtered, window.primitive, window.elapsed)
+        difference = predicted - self.target(window)
+        if self.config.robust:  # as the linear maps' fit, it is not to follow what is far off
+            error = F.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="none", beta=0.1)
+        else:
+            error = difference.square()
+        error = error @ self.loss_weights  # (B, M)
         return (error * window.mask).sum() / window.mask.sum(), divergence.mean()
 
     def target(self, window: Window) -> Tensor:
@@ -242,18 +270,23 @@ class HDRILPolicy(PreTrainedPolicy):
 
     def steps(self, elapsed: Tensor) -> Tensor:
         """Numbers (B, M) of the steps of a window that starts ``elapsed`` (B,) frames into its primitive."""
-        ahead = torch.arange(self.capacity, device=elapsed.device)
+        ahead = torch.arange(self.ahead, device=elapsed.device)
         return (elapsed[:, None] + ahead).clamp_max(self.capacity - 1)
 
     def planner_loss(self, history: History, window: Window) -> tuple[Tensor, float]:
-        """Cross-entropy over all frames of the episodes, and the share of them at which the most probable primitive is the
+        """Cross-entropy over all frames of the episodes, and the share of them at which the most probable answer is the
         right one; plus cross-entropy over the frames at which windows start, each seen without what was before it. That
         is all that :meth:`predict_action_chunk` has where no episode runs."""
-        logits, _ = self.planner(self.normalise(history.state), history.state)
-        alone, _ = self.planner(self.normalise(window.state)[:, None], window.state[:, None])
-        loss = F.cross_entropy(logits[history.mask], history.primitive[history.mask])
-        loss = loss + F.cross_entropy(alone[:, 0], window.primitive)
-        hits = (logits.argmax(-1) == history.primitive)[history.mask]
+        told = (history.playing, history.elapsed) if self.planner.steps else ()
+        nothing = torch.zeros_like(window.primitive)[:, None]
+        alone_told = (nothing + len(self.config.primitives), nothing) if self.planner.steps else ()
+        logits, _ = self.planner(self.normalise(history.state), history.state, None, *told)
+        alone, _ = self.planner(self.normalise(window.state)[:, None], window.state[:, None], None, *alone_told)
+        right, first = history.primitive, window.primitive
+        if self.planner.steps:  # 0 is that the primitive goes on
+            right, first = torch.where(history.begins, right + 1, 0), first + 1
+        loss = F.cross_entropy(logits[history.mask], right[history.mask]) + F.cross_entropy(alone[:, 0], first)
+        hits = (logits.argmax(-1) == right)[history.mask]
         return loss, hits.float().mean().item()
 
     # ------------------------------------------------------------------ prediction
@@ -269,28 +302,60 @@ class HDRILPolicy(PreTrainedPolicy):
             return self.normalise(state)
         return (self.relational.encode_state(state) - self.relational.state_mean) / self.relational.state_std
 
+    def linear_input(self, state: Tensor, filtered: Tensor) -> Tensor:
+        """What the linear maps see of states (B, S) and of the mean of the last ones (B, S)."""
+        given = self.dynamics_input(state)
+        return torch.cat([given, self.dynamics_input(filtered)], dim=-1) if self.config.filter_frames > 1 else given
+
+    def features(self, state: Tensor, filtered: Tensor) -> Tensor:
+        """What the fused maps see of states (B, S) and of the mean of the last ones (B, S)."""
+        assert self.frames is not None
+        given = [state, filtered] if self.config.filter_frames > 1 else [state]
+        seen = [(self.frames.features(each) - self.feature_mean) / self.feature_std for each in given]
+        return torch.cat(seen, dim=-1)
+
+    def _fused(self, state: Tensor, filtered: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
+        """Normalised outputs (B, M, A + S) of the fused maps; 0 for the states, which they do not predict."""
+        assert self.frames is not None
+        assert self.fused is not None
+        seen, start = self.features(state, filtered), torch.div(elapsed, self.ahead, rounding_mode="floor")
+        actions = len(self.config.action_names)
+        output = state.new_zeros(len(state), self.ahead, len(self.loss_weights))
+        for k in primitive.unique().tolist():
+            mine = (primitive == k).nonzero().squeeze(-1)
+            action = self.fused[k](seen[mine], start[mine], self.frames, state[mine])
+            output[mine, :, :actions] = (action - self.output_mean[:actions]) / self.output_std[:actions]
+        return output
+
     def model_of(self, primitive: int) -> PrimitiveDynamics:
         """The dynamics model of a primitive."""
         return cast(PrimitiveDynamics, self.dynamics[primitive if self.config.per_primitive else 0])
 
-    def predict(self, state: Tensor, primitive: Tensor, elapsed: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised actions and states (B, M, A + S), and divergence of the latent (B,), nats, from raw states (B, S),
-        ``elapsed`` (B,) frames into primitives (B,)."""
+    def predict(self, state: Tensor, filtered: Tensor, primitive: Tensor, elapsed: Tensor) -> tuple[Tensor, Tensor]:
+        """Normalised actions and states (B, M, A + S), and divergence of the latent (B,), nats, from raw states (B, S) and
+        the mean of the last ones (B, S), ``elapsed`` (B,) frames into primitives (B,)."""
+        output, divergence = self._network(state, filtered, primitive, elapsed)
+        if self.fused is not None:
+            output = output + self._fused(state, filtered, primitive, elapsed)
+        return output, divergence
+
+    def _network(self, state: Tensor, filtered: Tensor, primitive: Tensor, elapsed: Tensor) -> tuple[Tensor, Tensor]:
         normalised, samples = self.dynamics_input(state), self.config.samples
+        linear = self.linear_input(state, filtered)
         steps = self.steps(elapsed)
         if not self.config.per_primitive:
             context = F.one_hot(primitive, len(self.config.primitives)).to(state.dtype)
-            return self.model_of(0)(normalised, state, context, steps, samples)
+            return self.model_of(0)(normalised, state, context, steps, linear, samples)
         if self._stacks(primitive):
             context = state.new_zeros(len(state), 0)
             models = [self.model_of(k) for k in range(len(self.config.primitives))]
-            return predict_stacked(models, normalised, state, context, steps, primitive, samples)
-        result = torch.empty(len(state), self.capacity, len(self.loss_weights), device=state.device, dtype=state.dtype)
+            return predict_stacked(models, normalised, state, context, steps, linear, primitive, samples)
+        result = torch.empty(len(state), self.ahead, len(self.loss_weights), device=state.device, dtype=state.dtype)
         divergence = state.new_zeros(len(state))
         for k in primitive.unique().tolist():
             mine = (primitive == k).nonzero().squeeze(-1)
             context = state.new_zeros(len(mine), 0)
-            part, far = self.model_of(k)(normalised[mine], state[mine], context, steps[mine], samples)
+            part, far = self.model_of(k)(normalised[mine], state[mine], context, steps[mine], linear[mine], samples)
             result, divergence = result.index_copy(0, mine, part), divergence.index_copy(0, mine, far)
         return result, divergence
 
@@ -353,16 +418,30 @@ class HDRILPolicy(PreTrainedPolicy):
             parts.append(batch[key].flatten(0, -2))
         return torch.cat(parts, dim=-1)
 
-    def choose(self, state: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor]:
-        """States (B, S) and the planner's memory of what was before them to probabilities (B, K) and the new memory. A
-        primitive that was never learned from has probability 0."""
-        logits, updated = self.planner(self.normalise(state)[:, None], state[:, None], memory)
-        return logits[:, 0].masked_fill(self.longest_length == 0, -torch.inf).softmax(-1), updated
+    def choose(self, state: Tensor, previous: PlaybackState | None) -> Choice:
+        """What the planner says of states (B, S) that follow the frames of ``previous``. A primitive that was never learned
+        from has probability 0."""
+        told: tuple[Tensor, ...] = ()
+        if self.planner.steps:
+            nothing = torch.zeros(len(state), dtype=torch.long, device=state.device)
+            playing = nothing + len(self.config.primitives) if previous is None else previous.primitive
+            elapsed = nothing if previous is None else previous.elapsed + 1
+            told = playing[:, None], elapsed[:, None]
+        memory = None if previous is None else previous.memory
+        logits, updated = self.planner(self.normalise(state)[:, None], state[:, None], memory, *told)
+        never = self.longest_length == 0
+        if not self.planner.steps:
+            return Choice(logits[:, 0].masked_fill(never, -torch.inf).softmax(-1), None, updated)
+        answers = logits[:, 0].masked_fill(F.pad(never, (1, 0)), -torch.inf)
+        if previous is None:
+            answers = torch.cat([torch.full_like(answers[:, :1], -torch.inf), answers[:, 1:]], dim=-1)
+        answers = answers.softmax(-1)
+        return Choice(answers[:, 1:], answers[:, 0], updated)
 
-    def plan(self, state: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
+    def plan(self, state: Tensor, filtered: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
         """Actions and states (B, M, A + S) of the rest of primitives (B,), ``elapsed`` (B,) frames into them; metres, unit
-        quaternions, in the world's frame."""
-        predicted, _ = self.predict(state, primitive, elapsed)
+        quaternions, in the world's frame. ``filtered`` (B, S) is the mean of the last states."""
+        predicted, _ = self.predict(state, filtered, primitive, elapsed)
         plan = predicted * self.output_std + self.output_mean
         if self.relational is not None:
             plan = self.relational.decode_output(plan, state)

@@ -18,13 +18,28 @@ class Predictor(Protocol):
     shortest_length: Tensor  # (K,), frames
     longest_length: Tensor  # (K,), frames; 0 for a primitive that was never learned
 
-    def choose(self, state: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor]:
-        """States (B, S) and the planner's memory to probabilities (B, K) and the new memory."""
+    def choose(self, state: Tensor, previous: PlaybackState | None) -> Choice:
+        """What the planner says of states (B, S) that follow the frames of ``previous``."""
         ...
 
-    def plan(self, state: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
+    def plan(self, state: Tensor, filtered: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
         """Actions and states (B, M, A + S) of the rest of primitives (B,), ``elapsed`` (B,) frames into them."""
         ...
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a planner says of a frame of B episodes."""
+
+    begin: Tensor  # (B, K), probability that each primitive begins; that each one is right, without `go_on`
+    go_on: Tensor | None  # (B,), probability that the one that plays goes on, if the planner decides that
+    memory: Tensor  # (1, B, H)
+
+    def probabilities(self, playing: Tensor) -> Tensor:
+        """(B, K): of each primitive at this frame, where ``playing`` (B,) was at the one before."""
+        if self.go_on is None:
+            return self.begin
+        return self.begin.scatter_add(1, playing[:, None], self.go_on[:, None])
 
 
 @dataclass(frozen=True)
@@ -38,6 +53,8 @@ class PlaybackState:
     replanned: Tensor  # (B,), whether the plan was made at this frame
     probabilities: Tensor  # (B, K), the planner's at this frame
     seen: Tensor  # (B, S), the state at this frame: observed, or predicted in an open loop
+    recent: Tensor  # (B, n, S), the last states with that of this frame, `filter_frames` at most
+    begun: Tensor  # (B, K), how often each primitive has begun
     memory: Tensor  # (1, B, H), the planner's
 
     def row(self) -> Tensor:
@@ -53,7 +70,7 @@ class PlaybackState:
 
     def rest(self, longest_length: Tensor) -> Tensor:
         """The plan from this frame to its end (B, N, A + S). Where the ends differ, the last row is repeated."""
-        last = longest_length[self.primitive] - self.plan_start - 1  # (B,)
+        last = (longest_length[self.primitive] - self.plan_start).clamp_max(self.plan.shape[1]) - 1  # (B,)
         first = self.elapsed - self.plan_start
         ahead = first[:, None] + torch.arange(int((last - first).max()) + 1, device=self.plan.device)
         at = torch.minimum(ahead, last[:, None])[..., None].expand(-1, -1, self.plan.shape[-1])
@@ -63,32 +80,44 @@ class PlaybackState:
 def advance(policy: Predictor, previous: PlaybackState | None, observed: Tensor) -> PlaybackState:
     """The next frame of episodes, of which ``observed`` (B, S) is seen; ``previous`` is None at their start.
 
-    The planner is asked at every frame. A primitive is over after its longest recorded length, or from its shortest on as
-    soon as the planner prefers another; the planner may then choose the same one again. A plan is made at the start of a
-    primitive, and every ``replan_every`` frames. In an open loop the state that was predicted for this frame takes the
-    place of the one that is seen.
+    The planner is asked at every frame. A primitive is over after its longest recorded length; before that, if the planner
+    decides so (``termination=learned``), or from its shortest length on as soon as the planner prefers another. The same one
+    may be next. A plan is made at the start of a primitive, and every ``replan_every`` frames. In an open loop the state that
+    was predicted for this frame takes the place of the one that is seen.
     """
     if previous is not None and len(previous.primitive) != len(observed):
         previous = None
     state = observed
     if previous is not None and policy.config.rollout == "open_loop":
         state = previous.row()[:, -observed.shape[-1] :]
-    probabilities, memory = policy.choose(state, None if previous is None else previous.memory)
-    primitive, elapsed = _next_primitive(policy, previous, probabilities.argmax(-1))
+    choice = policy.choose(state, previous)
+    primitive, elapsed = _next_primitive(policy, previous, choice)
+    probabilities = choice.begin if previous is None else choice.probabilities(previous.primitive)
+    recent = state[:, None]
+    if previous is not None:
+        recent = torch.cat([previous.recent, recent], dim=1)[:, -policy.config.filter_frames :]
+    begun = torch.zeros_like(choice.begin, dtype=torch.long) if previous is None else previous.begun
+    begun = begun.scatter_add(1, primitive[:, None], (elapsed == 0).long()[:, None])
     replanned = elapsed == 0
     if policy.config.replan_every:
         replanned = elapsed % policy.config.replan_every == 0
-    plan, plan_start = _next_plan(policy, previous, state, primitive, elapsed, replanned)
-    return PlaybackState(primitive, elapsed, plan, plan_start, replanned, probabilities, state, memory)
+    plan, plan_start = _next_plan(policy, previous, state, recent.mean(1), primitive, elapsed, replanned)
+    return PlaybackState(
+        primitive, elapsed, plan, plan_start, replanned, probabilities, state, recent, begun, choice.memory
+    )
 
 
-def _next_primitive(policy: Predictor, previous: PlaybackState | None, best: Tensor) -> tuple[Tensor, Tensor]:
+def _next_primitive(policy: Predictor, previous: PlaybackState | None, choice: Choice) -> tuple[Tensor, Tensor]:
     """Primitives (B,) of this frame, and how many of their frames are over."""
+    highest, best = choice.begin.max(-1)
     if previous is None:
         return best, torch.zeros_like(best)
     playing, elapsed = previous.primitive, previous.elapsed + 1
     over = elapsed >= policy.longest_length[playing]
-    over |= (elapsed >= policy.shortest_length[playing]) & (best != playing)
+    if choice.go_on is None:
+        over |= (elapsed >= policy.shortest_length[playing]) & (best != playing)
+    else:
+        over |= highest > choice.go_on
     return torch.where(over, best, playing), torch.where(over, 0, elapsed)
 
 
@@ -96,15 +125,16 @@ def _next_plan(
     policy: Predictor,
     previous: PlaybackState | None,
     state: Tensor,
+    filtered: Tensor,
     primitive: Tensor,
     elapsed: Tensor,
     due: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Plans, and the frames of the primitives at which they start; new ones for the episodes that are ``due`` (B,)."""
     if previous is None:
-        return policy.plan(state, primitive, elapsed), elapsed
+        return policy.plan(state, filtered, primitive, elapsed), elapsed
     if not due.any():
         return previous.plan, previous.plan_start
     rows = due.nonzero().squeeze(-1)
-    plan = previous.plan.index_copy(0, rows, policy.plan(state[rows], primitive[rows], elapsed[rows]))
+    plan = previous.plan.index_copy(0, rows, policy.plan(state[rows], filtered[rows], primitive[rows], elapsed[rows]))
     return plan, torch.where(due, elapsed, previous.plan_start)

@@ -39,6 +39,13 @@ def _presets() -> dict[str, dict[str, Any]]:
         "samples": 0,
         "hidden_dim": _MULTI_HIDDEN,
     }
+    every["hdril_reactive"] = every["hdril"] | {
+        "coordinates": "fused",
+        "termination": "learned",
+        "filter_frames": 8,
+        "robust": True,
+        "replan_every": 1,
+    }
     return every
 
 

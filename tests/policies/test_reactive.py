@@ -1,0 +1,225 @@
+"""A policy that looks at every frame: when a primitive ends, what it filters, and predictions that frames agree on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from lerobot_policy_hdril import HDRILConfig
+from lerobot_policy_hdril.coordinates import multiply, rotate
+from lerobot_policy_hdril.dynamics import StateSkip, ridge_penalty, solve_ridge, usual_windows
+from lerobot_policy_hdril.fusion import FusedMaps, ObjectFrames
+from lerobot_policy_hdril.player import Choice
+from torch import Tensor
+
+from tests.policies.test_player import Scripted, play
+from tests.policies.tools import BATCH, FRAMES, STARTS, Training, build, demonstrations, observation
+
+POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+HAND, CUP, SHELF = ([f"{name}.{axis}" for axis in POSE] for name in ("left_ee", "cup", "shelf"))
+STATE = [*HAND, *CUP, *SHELF, "cup.size"]
+ACTION = [*HAND, "left_gripper.pos"]
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def turned(count: int, spread: float, draw: torch.Generator) -> Tensor:
+    """Unit quaternions (count, 4) within ``spread`` rad of none."""
+    angle = spread * (2.0 * torch.rand(count, 1, generator=draw, dtype=torch.float64) - 1.0)
+    axis = torch.nn.functional.normalize(torch.randn(count, 3, generator=draw, dtype=torch.float64), dim=-1)
+    return torch.cat([(angle / 2).sin() * axis, (angle / 2).cos()], dim=-1)
+
+
+def scenes(count: int, seed: int) -> Tensor:
+    """States (count, 22) in which hand, cup and shelf are anywhere, turned by up to 60 degrees."""
+    draw = generator(seed)
+    parts = []
+    for _ in range(3):
+        parts += [torch.rand(count, 3, generator=draw, dtype=torch.float64), turned(count, 1.0, draw)]
+    return torch.cat([*parts, torch.rand(count, 1, generator=draw, dtype=torch.float64)], dim=-1)
+
+
+# ---------------------------------------------------------------------- when a primitive is over
+
+
+class Deciding(Scripted):
+    """Wishes with a probability that the primitive that plays goes on."""
+
+    def __init__(self, wishes: list[tuple[int, float]], **config: Any) -> None:
+        super().__init__([], **config)
+        self.answers = iter(wishes)
+
+    def choose(self, state, previous):
+        wish, go_on = next(self.answers)
+        begin = (1.0 - go_on) * torch.nn.functional.one_hot(torch.tensor([wish]), 3).float()
+        return Choice(begin, None if previous is None else torch.tensor([go_on]), torch.zeros(1, 1, 1))
+
+
+def test_the_planner_decides_at_any_frame_what_goes_on_and_what_begins() -> None:
+    wishes = [(0, 0.0), (1, 0.9), (1, 0.1), (1, 0.8), (1, 0.2), (0, 0.0)]
+    states = play(Deciding(wishes), 6)
+    assert [(int(s.primitive), int(s.elapsed)) for s in states] == [(0, 0), (0, 1), (1, 0), (1, 1), (1, 0), (0, 0)]
+    assert states[-1].begun.tolist() == [[2, 2, 0]]
+
+
+def test_a_primitive_ends_at_its_longest_length_whatever_the_planner_says() -> None:
+    states = play(Deciding([(0, 0.0)] + [(1, 0.9)] * 5), 6)
+    assert [(int(s.primitive), int(s.elapsed)) for s in states][-2:] == [(0, 4), (1, 0)]
+
+
+def test_what_goes_on_counts_as_the_primitive_that_plays() -> None:
+    states = play(Deciding([(0, 0.0), (1, 0.75)]), 2)
+    assert states[1].probabilities.tolist() == [[0.75, 0.25, 0.0]]
+
+
+def test_the_filter_is_the_mean_of_the_last_states() -> None:
+    policy = Scripted([[0]] * 6, replan_every=1, filter_frames=3)
+    play(policy, 6)
+    assert policy.filtered == [[0.0], [0.5], [1.0], [2.0], [3.0], [4.0]]
+
+
+def test_histories_say_what_played_and_what_begins(metadata) -> None:
+    data = demonstrations(build(metadata))
+    history = data.history(torch.tensor([FRAMES + 3]))
+    assert history.begins[0].nonzero().flatten().tolist() == STARTS
+    assert history.playing[0, :12].tolist() == [6] + [0] * 10 + [1]
+    assert history.elapsed[0, :13].tolist() == [*range(11), 1, 2]
+
+
+def test_the_filter_of_the_demonstrations_is_the_one_of_the_policy(metadata) -> None:
+    policy = build(metadata, preset="hdril_reactive", hidden_dim=32).eval()
+    data = demonstrations(policy)
+    assert policy.config.filter_frames == 8
+    for t in range(20):
+        policy.select_action(observation(metadata, [FRAMES + t]))
+        assert policy._playback is not None
+        torch.testing.assert_close(policy._playback.recent.mean(1)[0], data.filtered[FRAMES + t])
+    torch.testing.assert_close(data.filtered[FRAMES], data.state[FRAMES])
+
+
+def test_a_trained_planner_goes_through_the_primitives(metadata) -> None:
+    training = Training(build(metadata, preset="hdril_reactive", hidden_dim=32, planner_batch_size=6), 60)
+    for _ in range(60):
+        training.step(BATCH)
+    policy = training.policy.eval()
+    starts = []
+    for t in range(FRAMES):
+        policy.select_action(observation(metadata, [t]))
+        assert policy._playback is not None
+        starts += [t] if policy._playback.elapsed.item() == 0 else []
+    assert starts == STARTS
+
+
+# ---------------------------------------------------------------------- robust fits
+
+
+def test_leave_one_out_errors_are_those_of_maps_without_the_row() -> None:
+    draw = generator()
+    x = torch.cat([torch.randn(30, 4, generator=draw, dtype=torch.float64), torch.ones(30, 1).double()], dim=1)
+    y, penalty = torch.randn(30, 2, generator=draw, dtype=torch.float64), ridge_penalty(x, 0.5)
+    _, errors = solve_ridge(x, y, penalty)
+    for row in (0, 17):
+        rest = torch.arange(30) != row
+        without, _ = solve_ridge(x[rest], y[rest], penalty)
+        torch.testing.assert_close(errors[row], y[row] - without @ x[row])
+
+
+def test_windows_that_are_far_off_are_left_out() -> None:
+    draw = generator()
+    x = torch.cat([torch.randn(200, 4, generator=draw, dtype=torch.float64), torch.ones(200, 1).double()], dim=1)
+    y = x @ torch.randn(5, 3, generator=draw, dtype=torch.float64) + 0.001 * torch.randn(200, 3, generator=draw)
+    y[::20] += 0.1
+    rows = torch.ones(200, dtype=torch.bool)
+    rows[5] = False
+    usual = usual_windows(x, y, rows, ridge_penalty(x, 1e-6))
+    expected = rows.clone()
+    expected[::20] = False
+    assert torch.equal(usual, expected)
+
+
+@pytest.mark.parametrize("robust", [True, False])
+def test_a_robust_map_is_not_moved_by_what_went_wrong(robust: bool) -> None:
+    draw = generator()
+    states, truth = torch.randn(200, 4, generator=draw).double(), torch.randn(3, 4, generator=draw).double()
+    target = (states @ truth.T + 0.001 * torch.randn(200, 3, generator=draw))[:, None]
+    target[::20] += 0.3
+    skip, mask = StateSkip(4, 3, 1, 1), torch.ones(200, 1, dtype=torch.bool)
+    skip.fit(states, torch.zeros(200, 1).long(), target, mask, 1e-3, torch.ones(3).double() if robust else None)
+    assert (bool(skip.bias.abs().max() < 1e-3)) is robust
+
+
+# ---------------------------------------------------------------------- frames
+
+
+def test_what_objects_see_does_not_change_when_the_world_is_moved() -> None:
+    frames, draw = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION).double(), generator(1)
+    states, turn, shift = scenes(5, 0), turned(1, 0.5, draw), torch.tensor([0.3, -1.0, 0.2]).double()
+    moved = states.clone()
+    for pose in frames.poses.tolist():
+        moved[:, pose[:3]] = rotate(turn.expand(5, 4), states[:, pose[:3]]) + shift
+        moved[:, pose[3:]] = multiply(turn.expand(5, 4), states[:, pose[3:]])
+    before, after = frames.features(states), frames.features(moved)
+    assert before.shape == (5, frames.dim) == (5, 22 + 2 * 2 * 7)
+    torch.testing.assert_close(after[:, 22:], before[:, 22:])
+    torch.testing.assert_close(before[:, :22], states)
+
+
+def fitted(target: Any, count: int = 300) -> tuple[FusedMaps, ObjectFrames]:
+    """Maps that were fitted to actions ``target(state)`` (N, 7) and a hand that is open by the cup's size."""
+    frames = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION).double()
+    maps, states = FusedMaps(frames.dim, 8, 2, 1, 1, 1).double(), scenes(count, 2)
+    action = torch.cat([target(states), states[:, -1:]], dim=-1)[:, None]
+    mask = torch.ones(count, 1, dtype=torch.bool)
+    start = torch.zeros(count, dtype=torch.long)
+    maps.fit(frames.features(states), start, action, frames.targets(action, states), mask, 1e-6, False)
+    return maps, frames
+
+
+def at_cup(states: Tensor) -> Tensor:
+    """10 cm before the cup and 20 to its side, turned with it."""
+    where = rotate(states[:, 10:14], torch.tensor([0.1, 0.2, 0.0]).double().expand(len(states), 3)) + states[:, 7:10]
+    return torch.cat([where, states[:, 10:14]], dim=-1)
+
+
+def at_place(states: Tensor) -> Tensor:
+    """The same place in the world, whatever stands where."""
+    return torch.tensor([0.4, 0.1, 0.3, 0.0, 0.6, 0.0, 0.8]).double().expand(len(states), 7)
+
+
+@pytest.mark.parametrize(("target", "best"), [(at_cup, 1), (at_place, 0)])
+def test_the_frame_in_which_demonstrations_agree_decides(target: Any, best: int) -> None:
+    maps, frames = fitted(target)
+    states = scenes(20, 3)
+    action = maps(frames.features(states), torch.zeros(20, dtype=torch.long), frames, states)[:, 0]
+    expected = target(states)
+    torch.testing.assert_close(action[:, :3], expected[:, :3], atol=2e-3, rtol=0)
+    dot = (action[:, 3:7] * expected[:, 3:]).sum(-1).abs()
+    assert dot.min() > 1.0 - 1e-4
+    torch.testing.assert_close(action[:, 7], states[:, -1], atol=1e-3, rtol=0)
+    spread = maps.covariance[:, 0, 0, 0].diagonal(dim1=-2, dim2=-1).sum(-1)
+    assert int(spread.argmin()) == best
+    assert spread.sort().values[1] > 10.0 * spread.min()
+
+
+def test_a_fused_policy_says_what_it_needs(metadata) -> None:
+    for values in (
+        {"replan_every": 0},
+        {"replan_every": 1, "rollout": "open_loop"},
+        {"replan_every": 1, "state_skip": False},
+    ):
+        with pytest.raises(
+            ValueError, match=r"^policy\.coordinates=fused needs policy\.state_skip=true, policy\.rollout="
+        ):
+            HDRILConfig(device="cpu", push_to_hub=False, coordinates="fused", **values)
+    with pytest.raises(
+        ValueError, match=r"^policy\.coordinates=fused needs poses of objects and poses in the actions; "
+    ):
+        ObjectFrames(STATE, [], ACTION)
+
+
+def test_a_fused_plan_is_as_long_as_it_acts(metadata) -> None:
+    policy = build(metadata, coordinates="fused", replan_every=2).eval()
+    assert policy.predict_action_chunk(observation(metadata, [0, FRAMES])).shape == (2, 2, 16)
