@@ -22,7 +22,8 @@ def check_perturbation(deviation: float) -> None:
 
 class PerturbedActor:
     """An actor whose commands reach the robot with noise: at every frame, each hand is sent elsewhere along each axis by a
-    normal number of standard deviation ``deviation``, m. Hands that are both closed are moved alike, because they may hold one body.
+    normal number of standard deviation ``deviation``, m. Hands that are both closed are moved alike, because they may hold one
+    body.
 
     The decision keeps the action that was meant; :attr:`~hdril.actor.Decision.sent` is what the robot gets.
     """
