@@ -17,9 +17,9 @@ from hdril.evaluation.identity import Identity, identify_trials
 from hdril.evaluation.results import headline
 from hdril.evaluation.stored import read_evaluation
 from hdril.evaluation.suite import SUITES, Cell, choose
-from hdril.evaluation.suite_folder import SuiteFolder
 from hdril.evaluation.suite_report import write_suite
 from hdril.evaluation.suite_table import tabulate_suite
+from hdril.evaluation.unfinished import UnfinishedFolder
 from hdril.workers import worker_pool
 
 
@@ -36,14 +36,15 @@ def evaluate_suite(config: EvalConfig, nominal: Job, detailed: bool, held_out: H
     names = [name for name in config.cells.split(",") if name]
     cells = choose(SUITES[config.suite](config.task, detailed), names)
     jobs = {cell.name: _job(nominal, cell) for cell in cells}
-    folder, start = SuiteFolder(output, _identity(config, jobs)), time.monotonic()
-    with folder.writing(), _pool(min(config.workers, config.num_episodes)) as pool:
+    unfinished = UnfinishedFolder(output, "suite", "suite_run.json", _identity(config, jobs))
+    start = time.monotonic()
+    with unfinished.writing(), _pool(min(config.workers, config.num_episodes)) as pool:
         results = {}
         for number, cell in enumerate(cells, 1):
-            results[cell.name] = _evaluate_cell(folder.cell(cell.name), config, jobs[cell.name], held_out, pool)
+            results[cell.name] = _evaluate_cell(unfinished.folder / cell.name, config, jobs[cell.name], held_out, pool)
             print(f"[{number}/{len(cells)}] {cell.name}: {headline(results[cell.name])}", flush=True)
-        write_suite(folder.folder, tabulate_suite(config.suite, config.task, cells, results))
-        folder.finish()
+        write_suite(unfinished.folder, tabulate_suite(config.suite, config.task, cells, results))
+        unfinished.finish()
     print(f"Table: {output / 'suite.md'}; {time.monotonic() - start:.0f} s")
 
 

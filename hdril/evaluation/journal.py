@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from hdril.evaluation.checkpoint import read_json
-from hdril.evaluation.identity import Identity, require_same
+from hdril.evaluation.identity import Identity
 from hdril.evaluation.score import Outcome
-from hdril.files import exclusively, write_atomically
+from hdril.evaluation.unfinished import UnfinishedFolder
 
-_RUN, _OUTCOMES, _LOCK = "run.json", "outcomes.jsonl", "lock"
+_OUTCOMES = "outcomes.jsonl"
 
 
 class Journal:
-    """An unfinished evaluation: the folder ``<output>.partial``, which :meth:`finish` renames to ``output``.
+    """An unfinished evaluation, in an :class:`~hdril.evaluation.unfinished.UnfinishedFolder`.
 
     ``run.json`` holds what is evaluated, ``outcomes.jsonl`` a line for each episode that was played. Nothing is written before
     :meth:`writing`.
@@ -30,21 +28,13 @@ class Journal:
     """
 
     def __init__(self, output: Path, identity: Identity) -> None:
-        self.output, self.folder = output, output.with_name(output.name + ".partial")
-        self._identity = identity
-        self.done: dict[int, Outcome] = {}
+        self._unfinished = UnfinishedFolder(output, "evaluation", "run.json", identity.as_dict(), key="identity")
+        self.folder = self._unfinished.folder
+        self.done = self._read()
         """Outcomes by seed: those of before, and those that were added."""
-        self._read()
 
-    def _read(self) -> None:
-        if self.output.exists():
-            raise FileExistsError(f"{self.output} exists; choose another output_dir or delete it")
-        if (self.folder / _RUN).exists():
-            stored = read_json(self.folder / _RUN).get("identity")
-            require_same(str(self.folder), stored, self._identity.as_dict(), "delete it or choose another output_dir")
-            self.done = {outcome.seed: outcome for outcome in _read_outcomes(self.folder / _OUTCOMES)}
-        elif self.folder.exists() and any(path.name != _LOCK for path in self.folder.iterdir()):
-            raise FileExistsError(f"{self.folder} exists and is no evaluation; delete it or choose another output_dir")
+    def _read(self) -> dict[int, Outcome]:
+        return {outcome.seed: outcome for outcome in _read_outcomes(self.folder / _OUTCOMES)}
 
     @contextmanager
     def writing(self) -> Iterator[Callable[[Outcome], None]]:
@@ -56,42 +46,25 @@ class Journal:
             BusyError: another process writes here.
             ValueError, FileExistsError: as for the class, if another process wrote here since.
         """
-        missing = [path for path in self.folder.parents if not path.exists()]
-        # A process that is kept out must not remove what the other one writes: the cleaning is done under the lock.
-        with exclusively(self.folder, f"evaluating into {self.output}"):
-            try:
-                self._read()
-            except (ValueError, FileExistsError):
-                if [path.name for path in self.folder.iterdir()] == [_LOCK]:  # made here, by the lock
-                    self._remove(missing)
-                raise
-            try:
-                run = json.dumps({"identity": self._identity.as_dict()}, indent=2)
-                write_atomically(self.folder / _RUN, lambda file: file.write(run.encode()))
-                with (self.folder / _OUTCOMES).open("a") as file:
+        # Files count, too: what another process played since must stay if it cannot be read.
+        with self._unfinished.writing(begun=lambda: bool(self.done or self._read())):
+            self.done = self._read()
+            with (self.folder / _OUTCOMES).open("a") as file:
 
-                    def add(outcome: Outcome) -> None:
-                        file.write(json.dumps(asdict(outcome)) + "\n")
-                        file.flush()
-                        self.done[outcome.seed] = outcome
+                def add(outcome: Outcome) -> None:
+                    file.write(json.dumps(asdict(outcome)) + "\n")
+                    file.flush()
+                    self.done[outcome.seed] = outcome
 
-                    yield add
-            except BaseException:
-                if not self.done:
-                    self._remove(missing)
-                raise
-
-    def _remove(self, made: list[Path]) -> None:
-        shutil.rmtree(self.folder, ignore_errors=True)
-        for path in made:  # the innermost first
-            if path.exists() and not any(path.iterdir()):
-                path.rmdir()
+                yield add
 
     def finish(self) -> None:
-        """Rename the folder to the output: all is written. Call it within :meth:`writing`, which keeps others out."""
-        for name in (_RUN, _OUTCOMES, _LOCK):
-            (self.folder / name).unlink(missing_ok=True)
-        self.folder.replace(self.output)
+        """Rename the folder to the output: all is written. Call it within :meth:`writing`, which keeps others out.
+
+        Raises:
+            OSError: a file, or a folder that is not empty, is at the output by now; the folder stays.
+        """
+        self._unfinished.finish(_OUTCOMES)
 
 
 def _read_outcomes(path: Path) -> Iterator[Outcome]:

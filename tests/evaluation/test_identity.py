@@ -291,6 +291,20 @@ def test_another_evaluation_that_began_in_between_is_left_alone(checkpoint: Path
     assert listing(tmp_path) == before
 
 
+def test_outcomes_that_cannot_be_read_are_left_alone(checkpoint: Path, tmp_path: Path) -> None:
+    """They came in between, so that this process knows of none."""
+    identity = job_of(checkpoint).identity
+    late = Journal(tmp_path / "eval", identity)
+    with Journal(tmp_path / "eval", identity).writing() as add:
+        add(outcome(SEED))
+    with (late.folder / "outcomes.jsonl").open("a") as file:
+        file.write('{"seed": 500001}\n')
+    before = listing(tmp_path)
+    with pytest.raises(KeyError), late.writing():
+        pass
+    assert listing(tmp_path) == before
+
+
 def test_what_is_evaluated_is_written_whole_or_not_at_all(
     checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,0 +1,95 @@
+"""Folders of results that are not finished: bound to what they are of, so that the same command can go on after a break."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hdril.evaluation.checkpoint import read_json
+from hdril.evaluation.identity import require_same
+from hdril.files import exclusively, write_atomically
+
+_LOCK = "lock"
+_REMEDY = "delete it or choose another output_dir"
+
+
+class UnfinishedFolder:
+    """The folder ``<output>.partial``, which :meth:`finish` renames to ``output``. Nothing is written before :meth:`writing`.
+
+    Args:
+        output: where the results will be.
+        kind: what they are, in one word.
+        record: name of the file that says what they are of.
+        identity: what they are of, as JSON has it.
+        key: of the identity in the record; empty if the record is the identity.
+
+    Raises:
+        ValueError: the folder holds unfinished results of something else, or a damaged record; names what differs.
+        FileExistsError: ``output`` exists, or the folder holds something that is not of this kind.
+    """
+
+    def __init__(self, output: Path, kind: str, record: str, identity: dict[str, Any], key: str = "") -> None:
+        self.output, self.folder = output, output.with_name(output.name + ".partial")
+        self._kind, self._record, self._identity, self._key = kind, record, identity, key
+        self._check()
+
+    def _check(self) -> None:
+        if self.output.exists():
+            raise FileExistsError(f"{self.output} exists; choose another output_dir or delete it")
+        if (self.folder / self._record).exists():
+            record = read_json(self.folder / self._record)
+            require_same(str(self.folder), record.get(self._key) if self._key else record, self._identity, _REMEDY)
+        elif self._holds_more_than(_LOCK):
+            raise FileExistsError(f"{self.folder} exists and is no {self._kind}; {_REMEDY}")
+
+    def _holds_more_than(self, *names: str) -> bool:
+        return self.folder.exists() and any(path.name not in names for path in self.folder.iterdir())
+
+    @contextmanager
+    def writing(self, begun: Callable[[], bool] | None = None) -> Iterator[None]:
+        """Keep other processes out until the end. If it fails before it has ``begun``, nothing is left behind.
+
+        Args:
+            begun: whether there is something to go on with; unless given, any file or folder beside the record.
+
+        Raises:
+            BusyError: another process writes here.
+            ValueError, FileExistsError: as for the class, if another process wrote here since.
+        """
+        missing = [path for path in self.folder.parents if not path.exists()]
+        # A process that is kept out must not remove what the other one writes: the cleaning is done under the lock.
+        with exclusively(self.folder, f"evaluating into {self.output}"):
+            with self._removed_unless(lambda: self._holds_more_than(_LOCK), missing):  # refused: the lock was made here
+                self._check()
+            with self._removed_unless(begun or (lambda: self._holds_more_than(self._record, _LOCK)), missing):
+                record = json.dumps({self._key: self._identity} if self._key else self._identity, indent=2)
+                write_atomically(self.folder / self._record, lambda file: file.write(record.encode()))
+                yield
+
+    @contextmanager
+    def _removed_unless(self, kept: Callable[[], bool], made: list[Path]) -> Iterator[None]:
+        """Remove the folder, and those of ``made`` that are empty then, if what is done in this context fails."""
+        try:
+            yield
+        except BaseException:
+            if not kept():
+                shutil.rmtree(self.folder, ignore_errors=True)
+                for path in made:  # the innermost first
+                    if path.exists() and not any(path.iterdir()):
+                        path.rmdir()
+            raise
+
+    def finish(self, *scratch: str) -> None:
+        """Rename the folder to the output, without the files ``scratch``: all is written. Call it within :meth:`writing`,
+        which keeps others out.
+
+        Raises:
+            OSError: a file, or a folder that is not empty, is at ``output`` by now; the folder stays.
+        """
+        for name in (self._record, *scratch, _LOCK):
+            (self.folder / name).unlink(missing_ok=True)
+        self.folder.replace(self.output)
