@@ -230,7 +230,8 @@ class BimanualEnv(gym.Env):
 
     def exact_observation(self) -> dict[str, NDArray[np.float32]]:
         """The observation without noise and delay, with everything that may vary between scenes: for demonstrators."""
-        poses = [self._poses.get(name) or self.world.pose(name) for name in self._whole.objects]
+        world = self.world
+        poses = [self._poses.get(name) or world.pose(name) for name in self._whole.objects]
         seen = [pose.aligned_to(IDENTITY_QUATERNION).as_vector() for pose in poses]
         return {
             "agent_pos": self._hands.copy(),

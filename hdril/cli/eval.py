@@ -61,8 +61,9 @@ class EvalConfig:
     seed: int = 100_000
     """First seed. Seeds that the policy was trained on are refused."""
     max_frames: int | None = None
-    """Frames after which an episode is cut; at least the task's horizon. By default that is its budget: the horizon, or three
-    times that where something may happen to the episode. With more, a policy that failed may try again."""
+    """Frames after which an episode is cut; at least the task's horizon. By default that is its budget: the frames of the
+    task's longest plan, or three times as many where scenes vary or something may happen. With more, a policy that failed
+    may try again."""
     training_data: Path | None = None
     """Folder of the dataset that the policy was trained on, if it is not found: to check that the seeds are held out. It
     must have the statistics that the checkpoint keeps. Checkpoints of hdril know their training data."""

@@ -170,11 +170,11 @@ def test_what_objects_see_does_not_change_when_the_world_is_moved() -> None:
 def fitted(target: Any, count: int = 300) -> tuple[FusedMaps, ObjectFrames]:
     """Maps that were fitted to actions ``target(state)`` (N, 7) and a hand that is open by the cup's size."""
     frames = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION).double()
-    maps, states = FusedMaps(frames.dim, 8, 2, 1, 1, 1).double(), scenes(count, 2)
+    maps, states = FusedMaps(frames.dim, frames, 1, 1).double(), scenes(count, 2)
     action = torch.cat([target(states), states[:, -1:]], dim=-1)[:, None]
     mask = torch.ones(count, 1, dtype=torch.bool)
     start = torch.zeros(count, dtype=torch.long)
-    maps.fit(frames.features(states), start, action, frames.targets(action, states), mask, 1e-6, False)
+    maps.fit(frames.features(states), start, frames, states, action, mask, 1e-6, False)
     return maps, frames
 
 
@@ -218,6 +218,10 @@ def test_a_fused_policy_says_what_it_needs(metadata) -> None:
         ValueError, match=r"^policy\.coordinates=fused needs poses of objects and poses in the actions; "
     ):
         ObjectFrames(STATE, [], ACTION)
+    with pytest.raises(
+        ValueError, match=r"^policy\.filter_frames is for policy\.state_skip=true; got 8 and state_skip=false$"
+    ):
+        HDRILConfig(device="cpu", push_to_hub=False, filter_frames=8, state_skip=False)
 
 
 def test_a_fused_plan_is_as_long_as_it_acts(metadata) -> None:

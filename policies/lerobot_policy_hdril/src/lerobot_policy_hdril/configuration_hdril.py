@@ -52,8 +52,8 @@ class HDRILConfig(PreTrainedConfig):
     filter_frames: int = 1
     """The linear maps see the mean of the last so many states beside the present one: observations are noisy. 1: no mean."""
     robust: bool = False
-    """Leave out of the linear maps' fit what is far off it: in demonstrations of scenes where something goes wrong, some
-    windows show how that was mended."""
+    """Leave out of the linear maps' fit what is far off it, and train the network with Huber's loss: in demonstrations of
+    scenes where something goes wrong, some windows show how that was mended."""
     termination: Termination = "length"
     """When a primitive is over. ``length``: after its shortest recorded length, as soon as the planner prefers another.
     ``learned``: the planner decides at every frame whether it goes on or one begins, maybe the same again; for
@@ -170,6 +170,10 @@ class HDRILConfig(PreTrainedConfig):
         if self.experts == "stacked" and self.decoder == "ode":
             raise ValueError(
                 "policy.experts=stacked works with policy.decoder=gru: the ODE's solver cannot be batched so"
+            )
+        if self.filter_frames > 1 and not self.state_skip:
+            raise ValueError(
+                f"policy.filter_frames is for policy.state_skip=true; got {self.filter_frames} and state_skip=false"
             )
         if self.coordinates == "fused" and not (
             self.state_skip and self.rollout == "closed_loop" and self.replan_every

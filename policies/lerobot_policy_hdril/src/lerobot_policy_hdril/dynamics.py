@@ -183,19 +183,6 @@ class PrimitiveDynamics(nn.Module):
 
     skip_columns: Tensor
 
-    def fit_state_skip(
-        self,
-        normalised: Tensor,
-        steps: Tensor,
-        target: Tensor,
-        mask: Tensor,
-        ridge: float,
-        scale: Tensor | None = None,
-    ) -> None:
-        """Solve the linear maps, see :meth:`StateSkip.fit`; nothing to do without them."""
-        if self.state_skip is not None:
-            self.state_skip.fit(normalised, steps, target, mask, ridge, scale)
-
     def forward(
         self,
         normalised: Tensor,

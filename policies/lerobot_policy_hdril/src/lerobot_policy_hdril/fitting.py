@@ -116,12 +116,12 @@ def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Te
     rows = demonstrations.replan_rows(policy.ahead, episodes)
     for k in range(len(maps)):
         window = _window(demonstrations, rows[demonstrations.label[rows] == k], policy.ahead, policy.ahead)
-        action = window.target[..., :actions]
         cast(FusedMaps, maps[k]).fit(
             policy.features(window.state, window.filtered),
             torch.div(window.elapsed, policy.ahead, rounding_mode="floor"),
-            action,
-            frames.targets(action, window.state),
+            frames,
+            window.state,
+            window.target[..., :actions],
             window.mask,
             policy.config.ridge,
             policy.config.robust,
@@ -157,7 +157,9 @@ def _fit_state_skips(policy: HDRILPolicy, demonstrations: Demonstrations, episod
     for k in range(len(policy.dynamics)):
         mine = rows[demonstrations.label[rows] == k] if policy.config.per_primitive else rows
         window = _window(demonstrations, mine, stride, policy.capacity)
-        policy.model_of(k).fit_state_skip(
+        skip = policy.model_of(k).state_skip
+        assert skip is not None
+        skip.fit(
             policy.linear_input(window.state, window.filtered),
             policy.steps(window.elapsed),
             policy.target(window),

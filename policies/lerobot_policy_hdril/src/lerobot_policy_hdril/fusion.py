@@ -42,7 +42,9 @@ class ObjectFrames(nn.Module):
                 f"objects: {', '.join(objects)}; actions: {', '.join(action_names)}"
             )
         others = [[place for place, group in enumerate(poses) if group != frame] for frame in frames]
-        for name, value in (("poses", poses), ("frames", frames), ("others", others), ("hands", hands)):
+        rest = [i for i in range(len(action_names)) if not any(i in hand for hand in hands)]
+        columns = {"poses": poses, "frames": frames, "others": others, "hands": hands, "rest": rest}
+        for name, value in columns.items():
             self.register_buffer(name, torch.tensor(value, dtype=torch.long), persistent=False)
         self.dim = len(state_names) + 7 * sum(map(len, others))
 
@@ -50,31 +52,32 @@ class ObjectFrames(nn.Module):
     frames: Tensor  # (F, 7), those of objects
     others: Tensor  # (F, P - 1), which poses are seen from each
     hands: Tensor  # (G, 7), columns of an action
+    rest: Tensor  # columns of an action that are no pose's
 
-    def origins(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Positions (B, F, 3) and unit quaternions (B, F, 4) of the objects in states (B, S)."""
-        poses = state[:, self.frames]
-        return poses[..., :3], F.normalize(poses[..., 3:], dim=-1)
+    def origins(self, state: Tensor) -> Tensor:
+        """Poses (1 + F, B, 7) of the world and of the objects in states (B, S)."""
+        world = torch.tensor((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)).to(state).expand(1, len(state), 7)
+        objects = state[:, self.frames].transpose(0, 1)
+        objects = torch.cat([objects[..., :3], F.normalize(objects[..., 3:], dim=-1)], dim=-1)
+        return torch.cat([world, objects])
 
     def features(self, state: Tensor) -> Tensor:
         """States (B, S) and beside them (B, D - S) the poses of everything in every object's frame; w >= 0."""
-        position, quaternion = self.origins(state)
         poses = state[:, self.poses][:, self.others]  # (B, F, P - 1, 7)
-        seen = _into(poses, position[:, :, None], quaternion[:, :, None])
+        seen = _into(poses, self.origins(state)[1:].transpose(0, 1)[:, :, None])
         seen = torch.cat([seen[..., :3], torch.where(seen[..., 6:] < 0, -seen[..., 3:], seen[..., 3:])], dim=-1)
         return torch.cat([state, seen.flatten(1)], dim=-1)
 
     def targets(self, action: Tensor, state: Tensor) -> Tensor:
         """Hands of actions (B, M, A) as seen from the world and from the objects of states (B, S): (1 + F, B, M, G, 7)."""
-        hands = action[..., self.hands]
-        position, quaternion = self.origins(state)
-        seen = [_into(hands, position[:, f, None, None], quaternion[:, f, None, None]) for f in range(len(self.frames))]
-        return torch.stack([hands, *seen])
+        origins = self.origins(state)[:, :, None, None]
+        return _into(action[..., self.hands].expand(len(origins), -1, -1, -1, -1), origins)
 
 
-def _into(poses: Tensor, position: Tensor, quaternion: Tensor) -> Tensor:
-    inverse = conjugate(quaternion).expand(*poses.shape[:-1], 4)
-    return torch.cat([rotate(inverse, poses[..., :3] - position), multiply(inverse, poses[..., 3:])], dim=-1)
+def _into(poses: Tensor, origin: Tensor) -> Tensor:
+    """Poses (..., 7) as seen from an origin (..., 7)."""
+    inverse = conjugate(origin[..., 3:]).expand(*poses.shape[:-1], 4)
+    return torch.cat([rotate(inverse, poses[..., :3] - origin[..., :3]), multiply(inverse, poses[..., 3:])], dim=-1)
 
 
 class FusedMaps(nn.Module):
@@ -86,24 +89,22 @@ class FusedMaps(nn.Module):
         x = (sum_f P_f)^-1 sum_f P_f (R_f y_f + t_f)        P_f = R_f S_f^-1 R_f^T
 
     and the orientation is the mean of the frames' quaternions, weighted by the inverse of their variances. What is no pose,
-    such as the opening of a hand, is predicted by a map of the world's frame.
+    such as the opening of a hand, has a map of its own.
 
     Args:
         features: numbers that are seen.
-        actions: numbers of an action.
-        frames: frames beside the world.
-        hands: poses in an action.
+        frames: the frames, and what of an action is a pose.
         starts: frames of a primitive at which plans are made.
         ahead: frames that a plan predicts.
     """
 
-    def __init__(self, features: int, actions: int, frames: int, hands: int, starts: int, ahead: int) -> None:
+    def __init__(self, features: int, frames: ObjectFrames, starts: int, ahead: int) -> None:
         super().__init__()
-        grid, width = (starts, ahead), 7 * hands
-        self.register_buffer("weight", torch.zeros(1 + frames, *grid, width, features + 1))
-        self.register_buffer("plain", torch.zeros(*grid, actions, features + 1))
-        self.register_buffer("covariance", torch.eye(3).expand(1 + frames, *grid, hands, 3, 3).clone())
-        self.register_buffer("variance", torch.ones(1 + frames, *grid, hands))
+        count, hands, grid = 1 + len(frames.frames), len(frames.hands), (starts, ahead)
+        self.register_buffer("weight", torch.zeros(count, *grid, 7 * hands, features + 1))
+        self.register_buffer("plain", torch.zeros(*grid, len(frames.rest), features + 1))
+        self.register_buffer("covariance", torch.eye(3).expand(count, *grid, hands, 3, 3).clone())
+        self.register_buffer("variance", torch.ones(count, *grid, hands))
 
     weight: Tensor
     plain: Tensor
@@ -112,24 +113,33 @@ class FusedMaps(nn.Module):
 
     @torch.no_grad()
     def fit(
-        self, seen: Tensor, start: Tensor, action: Tensor, poses: Tensor, mask: Tensor, ridge: float, robust: bool
+        self,
+        seen: Tensor,
+        start: Tensor,
+        frames: ObjectFrames,
+        state: Tensor,
+        action: Tensor,
+        mask: Tensor,
+        ridge: float,
+        robust: bool,
     ) -> None:
         """Solve the maps, in float64, see :func:`~lerobot_policy_hdril.dynamics.solve_ridge`.
 
         Args:
             seen: features (N, D).
             start: which of the starts a window has (N,).
+            frames: the frames of the states.
+            state: states (N, S) at which windows start.
             action: (N, M, A).
-            poses: the actions' hands in every frame (1 + F, N, M, G, 7).
             mask: (N, M), True where there is an action.
             ridge: weight of the penalty.
             robust: leave out windows that are far off a first fit.
         """
-        for buffer in (self.weight, self.plain):
-            buffer.zero_()
+        for buffer, value in ((self.weight, 0.0), (self.plain, 0.0), (self.variance, 1.0)):
+            buffer.fill_(value)
         self.covariance.copy_(torch.eye(3).expand_as(self.covariance))
-        self.variance.fill_(1.0)
         inputs = torch.cat([seen, torch.ones_like(seen[:, :1])], dim=-1).double()
+        poses, rest = frames.targets(action, state).double(), action[..., frames.rest].double()
         penalty = ridge_penalty(inputs, ridge)
         for first in start.unique().tolist():
             rows = (start == first) & mask[:, 0]
@@ -138,53 +148,45 @@ class FusedMaps(nn.Module):
             for step in range(mask.shape[1]):
                 here = rows & mask[:, step]
                 if here.any():
-                    self._fit_step(first, step, inputs[here], action[here, step], poses[:, here, step], penalty)
+                    self._fit_step(first, step, inputs[here], poses[:, here, step], rest[here, step], penalty)
 
-    def _fit_step(self, first: int, step: int, x: Tensor, action: Tensor, poses: Tensor, penalty: Tensor) -> None:
-        poses = _same_signs(poses.double())
-        outputs = torch.cat([action.double(), *poses.flatten(2)], dim=-1)
-        solution, errors = solve_ridge(x, outputs, penalty)
-        width = poses[0].flatten(1).shape[1]
-        self.plain[first, step] = solution[: action.shape[1]].to(self.plain)
-        for f, (maps, far) in enumerate(
-            zip(solution[action.shape[1] :].split(width), errors[:, action.shape[1] :].split(width, dim=1), strict=True)
-        ):
-            far = far.unflatten(1, (-1, 7))  # (N, G, 7)
-            self.weight[f, first, step] = maps.to(self.weight)
-            second = torch.einsum("ngi,ngj->gij", far[..., :3], far[..., :3]) / len(far)
-            self.covariance[f, first, step] = (second + _FLOOR * torch.eye(3).to(second)).to(self.covariance)
-            self.variance[f, first, step] = far[..., 3:].square().sum(-1).mean(0).add(_FLOOR).to(self.variance)
+    def _fit_step(self, first: int, step: int, x: Tensor, poses: Tensor, rest: Tensor, penalty: Tensor) -> None:
+        """Poses (1 + F, N, G, 7) and the rest of the actions (N, A - 7 G) from x (N, D + 1)."""
+        outputs = _same_signs(poses).transpose(0, 1).flatten(1)  # (N, (1 + F) G 7)
+        solution, errors = solve_ridge(x, torch.cat([rest, outputs], dim=-1), penalty)
+        count = rest.shape[1]
+        self.plain[first, step] = solution[:count].to(self.plain)
+        self.weight[:, first, step] = solution[count:].unflatten(0, (len(poses), -1)).to(self.weight)
+        far = errors[:, count:].unflatten(1, (len(poses), -1, 7))  # (N, 1 + F, G, 7)
+        second = torch.einsum("nfgi,nfgj->fgij", far[..., :3], far[..., :3]) / len(far)
+        self.covariance[:, first, step] = (second + _FLOOR * torch.eye(3).to(second)).to(self.covariance)
+        self.variance[:, first, step] = (far[..., 3:].square().sum(-1).mean(0) + _FLOOR).to(self.variance)
 
     def forward(self, seen: Tensor, start: Tensor, frames: ObjectFrames, state: Tensor) -> Tensor:
         """Features (B, D) at starts (B,) of plans, and the states (B, S) there, to actions (B, M, A) in the world."""
         inputs = torch.cat([seen, torch.ones_like(seen[:, :1])], dim=-1)
-        action = torch.einsum("bmad,bd->bma", self.plain[start], inputs)
         poses = torch.einsum("fbmwd,bd->fbmw", self.weight[:, start], inputs).unflatten(-1, (-1, 7))
-        position, quaternion = frames.origins(state)
-        position, quaternion = position.transpose(0, 1)[:, :, None, None], quaternion.transpose(0, 1)[:, :, None, None]
-        count = (*poses.shape[:-1], 4)
-        turns = torch.cat([_identity(poses).expand(count)[:1], quaternion.expand(len(quaternion), *count[1:])])
-        origins = torch.cat([torch.zeros_like(poses[:1, ..., :3]), position.expand(*turns[1:, ..., :3].shape)])
-        means = rotate(turns, poses[..., :3]) + origins  # (1 + F, B, M, G, 3)
-        axes = rotate(turns[..., None, :].expand(*count[:-1], 3, 4), torch.eye(3).to(poses).expand(*count[:-1], 3, 3))
+        origins = frames.origins(state)[:, :, None, None].expand_as(poses)  # (1 + F, B, M, G, 7)
+        turns = origins[..., 3:]
+        means = rotate(turns, poses[..., :3]) + origins[..., :3]
+        axes = torch.eye(3).to(poses).expand(*turns.shape[:-1], 3, 3)
+        axes = rotate(turns[..., None, :].expand(*axes.shape[:-1], 4), axes)  # the rows are a frame's axes
         precision = torch.linalg.inv(axes.mT @ self.covariance[:, start] @ axes)
-        total = precision.sum(0)
-        fused = torch.linalg.solve(total, (precision @ means[..., None]).sum(0))[..., 0]
+        position = torch.linalg.solve(precision.sum(0), (precision @ means[..., None]).sum(0))[..., 0]
         rotations = multiply(turns, F.normalize(poses[..., 3:], dim=-1))
-        sign = torch.where((rotations * rotations[:1]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
-        mean = (sign * rotations / self.variance[:, start][..., None]).sum(0)
-        action[..., frames.hands] = torch.cat([fused, F.normalize(mean, dim=-1)], dim=-1)
+        quaternion = (_towards(rotations, rotations[:1]) / self.variance[:, start][..., None]).sum(0)
+        rest = torch.einsum("bmad,bd->bma", self.plain[start], inputs)
+        action = rest.new_empty(*rest.shape[:2], len(frames.rest) + frames.hands.numel())
+        action[..., frames.rest] = rest
+        action[..., frames.hands] = torch.cat([position, F.normalize(quaternion, dim=-1)], dim=-1)
         return action
-
-
-def _identity(like: Tensor) -> Tensor:
-    return torch.tensor((0.0, 0.0, 0.0, 1.0), dtype=like.dtype, device=like.device)
 
 
 def _same_signs(poses: Tensor) -> Tensor:
     """Poses (F, N, G, 7) whose quaternions have the sign that is nearer to those of the other windows."""
-    quaternion = poses[..., 3:]
-    for reference in (quaternion[:, :1], None):
-        near = quaternion.mean(1, keepdim=True) if reference is None else reference
-        quaternion = torch.where((quaternion * near).sum(-1, keepdim=True) < 0, -quaternion, quaternion)
-    return torch.cat([poses[..., :3], quaternion], dim=-1)
+    quaternion = _towards(poses[..., 3:], poses[:, :1, :, 3:])  # so that they have a mean
+    return torch.cat([poses[..., :3], _towards(quaternion, quaternion.mean(1, keepdim=True))], dim=-1)
+
+
+def _towards(quaternion: Tensor, reference: Tensor) -> Tensor:
+    return torch.where((quaternion * reference).sum(-1, keepdim=True) < 0, -quaternion, quaternion)

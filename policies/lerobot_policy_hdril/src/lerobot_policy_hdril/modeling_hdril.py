@@ -127,12 +127,9 @@ class HDRILPolicy(PreTrainedPolicy):
             frames = self.frames = ObjectFrames(names, config.environment_names, config.action_names)
             seen = frames.dim * (2 if config.filter_frames > 1 else 1)
             starts = -(-self.capacity // self.ahead)
-            self.fused = nn.ModuleList(
-                FusedMaps(seen, action_dim, len(frames.frames), len(frames.hands), starts, self.ahead)
-                for _ in config.primitives
-            )
-            for key, size in (("feature_mean", frames.dim), ("feature_std", frames.dim)):
-                self.register_buffer(key, torch.ones(size))
+            self.fused = nn.ModuleList(FusedMaps(seen, frames, starts, self.ahead) for _ in config.primitives)
+            self.register_buffer("feature_mean", torch.zeros(frames.dim))
+            self.register_buffer("feature_std", torch.ones(frames.dim))
         for key, size in (("state", state_dim), ("output", action_dim + state_dim)):
             self.register_buffer(f"{key}_mean", torch.zeros(size))
             self.register_buffer(f"{key}_std", torch.ones(size))

@@ -52,10 +52,14 @@ class PlaybackState:
     plan_start: Tensor  # (B,)
     replanned: Tensor  # (B,), whether the plan was made at this frame
     probabilities: Tensor  # (B, K), the planner's at this frame
-    seen: Tensor  # (B, S), the state at this frame: observed, or predicted in an open loop
-    recent: Tensor  # (B, n, S), the last states with that of this frame, `filter_frames` at most
+    recent: Tensor  # (B, n, S), the last states, `filter_frames` at most: observed, or predicted in an open loop
     begun: Tensor  # (B, K), how often each primitive has begun
     memory: Tensor  # (1, B, H), the planner's
+
+    @property
+    def seen(self) -> Tensor:
+        """(B, S), the state at this frame."""
+        return self.recent[:, -1]
 
     def row(self) -> Tensor:
         """This frame's row (B, A + S) of the plan: the action, and the state that it leads to."""
@@ -102,9 +106,7 @@ def advance(policy: Predictor, previous: PlaybackState | None, observed: Tensor)
     if policy.config.replan_every:
         replanned = elapsed % policy.config.replan_every == 0
     plan, plan_start = _next_plan(policy, previous, state, recent.mean(1), primitive, elapsed, replanned)
-    return PlaybackState(
-        primitive, elapsed, plan, plan_start, replanned, probabilities, state, recent, begun, choice.memory
-    )
+    return PlaybackState(primitive, elapsed, plan, plan_start, replanned, probabilities, recent, begun, choice.memory)
 
 
 def _next_primitive(policy: Predictor, previous: PlaybackState | None, choice: Choice) -> tuple[Tensor, Tensor]:
