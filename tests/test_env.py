@@ -12,10 +12,11 @@ import pytest
 
 import hdril
 from hdril.actor import Decision, Observation
-from hdril.env import BimanualEnv
+from hdril.env import START_CLEARANCE, BimanualEnv
 from hdril.rollout import run_episode
 from hdril.simulation import world
 from hdril.simulation.robots import ROBOTS
+from hdril.simulation.world import ROBOT, World
 from hdril.tasks import TASKS, get_task
 from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.primitives import Noise
@@ -140,3 +141,27 @@ def test_closing_goes_on_after_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(KeyboardInterrupt):
         env.close()
     env.close()
+
+
+@pytest.mark.parametrize(
+    ("task", "seed"), [("peg_in_hole", 932_007), ("table_lift", 932_000), ("clear_and_lift", 932_003)]
+)
+def test_arms_do_not_start_at_an_object(task: str, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In these scenes they would: the first posture that is drawn is not the one that is taken."""
+    with closing(BimanualEnv(f"{task}:posture=0.1")) as env:
+        tried: list[bool] = []
+        start = env.controller.start
+
+        def watched(scene: World, offsets: dict[str, float] | None = None) -> None:
+            start(scene, offsets)
+            movable = [body.name for body in env.task_spec.bodies if body.mass > 0.0]
+            tried.append(any(scene.near(ROBOT, name, START_CLEARANCE) for name in movable))
+
+        monkeypatch.setattr(env.controller, "start", watched)
+        env.reset(seed=seed)
+        assert tried == [True, False]
+
+
+def test_an_exact_observation_needs_an_episode() -> None:
+    with pytest.raises(RuntimeError, match="no episode is running"):
+        BimanualEnv("table_lift").exact_observation()
