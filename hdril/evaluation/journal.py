@@ -75,5 +75,6 @@ def _read_outcomes(path: Path) -> Iterator[Outcome]:
             return  # the process ended while it wrote the last line: that seed is played again
         for name in ("start", "primitives"):
             values[name] = tuple(values[name])
-        values["events"] = tuple((frame, event) for frame, event in values["events"])
+        for name in ("events", "noticed"):
+            values[name] = tuple((frame, words) for frame, words in values[name])
         yield Outcome(**values)

@@ -46,7 +46,7 @@ def markdown(summary: Mapping[str, Any], outcomes: Sequence[Outcome]) -> str:
         *_order(summary["pc_expert_order"]),
         *_comparison(summary["comparison"]),
         *_planner(summary["planner"], get_task(summary["task"]).labels),
-        *_events([outcome for outcome in outcomes if outcome.events], get_task(summary["task"]).physics.control_period),
+        *_events([o for o in outcomes if o.events or o.noticed], get_task(summary["task"]).physics.control_period),
         *(_failures(summary, failures) if failures else []),
     ]
     return "\n\n".join(blocks) + "\n"
@@ -124,16 +124,20 @@ def _planner(planner: Mapping[str, Any] | None, labels: tuple[str, ...]) -> list
     ]
 
 
-def _events(disturbed: Sequence[Outcome], period: float) -> list[str]:
-    """What happened to the episodes, and when."""
-    if not disturbed:
+def _events(eventful: Sequence[Outcome], period: float) -> list[str]:
+    """What happened to the episodes and when, and what the policy noticed."""
+    if not eventful:
         return []
     rows = [
-        [outcome.seed, f"{period * frame:.1f}", event, "success" if outcome.success else f"failure: {outcome.unmet}"]
-        for outcome in disturbed
-        for frame, event in outcome.events
+        [
+            outcome.seed,
+            "; ".join(f"{event} at {period * frame:.1f} s" for frame, event in outcome.events),
+            outcome.noticed_in_words(period),
+            "success" if outcome.success else f"failure: {outcome.unmet}",
+        ]
+        for outcome in eventful
     ]
-    return ["## Events", table(("seed", "at, s", "event", "outcome"), rows)]
+    return ["## Events", table(("seed", "happened", "the policy noticed", "outcome"), rows)]
 
 
 def _failures(summary: Mapping[str, Any], failures: Sequence[Outcome]) -> list[str]:

@@ -65,8 +65,17 @@ class Outcome:
     """How many of the task's stages were reached; success counts as one more."""
     events: tuple[tuple[int, str], ...] = ()
     """What happened to the episode: frames, and events in words."""
+    noticed: tuple[tuple[int, str], ...] = ()
+    """What the policy said that it noticed, by ``explain()``: frames, and its words; empty if it says nothing."""
     scenario: str = ""
     """The scene and what happened to it, as JSON (:class:`hdril.tasks.scenario.Scenario`)."""
+
+    def noticed_in_words(self, period: float) -> str:
+        """What the policy noticed, each thing once with all its times, for a ``period`` of control in s."""
+        times: dict[str, list[str]] = {}
+        for frame, words in self.noticed:
+            times.setdefault(words, []).append(f"{period * frame:.1f} s")
+        return "; ".join(f"{words} at {', '.join(at)}" for words, at in times.items())
 
 
 def score_episode(task: Task, seed: int, trace: Trace, reference: Reference, ending: Ending) -> Outcome:
@@ -97,6 +106,7 @@ def score_episode(task: Task, seed: int, trace: Trace, reference: Reference, end
         motion={name: round(float(value), 5) for name, value in vars(moved).items()},
         stages=int(trace.stage[-1]),
         events=tuple((frame, event) for frame, event in enumerate(trace.events) if event),
+        noticed=tuple((i, words) for i, told in enumerate(trace.explanations) if told for words in told.events),
         scenario=trace.scenario.to_json(),
     )
 

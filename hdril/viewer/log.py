@@ -170,6 +170,8 @@ class EpisodeLog:
         outcome, times = self._outcome, self._times
         for frame, event in outcome.events:
             self._log_at(frame, "log", rr.TextLog(event, level="WARN"))
+        for frame, words in outcome.noticed:
+            self._log_at(frame, "log", rr.TextLog(words))
         for frame, failure in enumerate(self._trace.ik_failures):
             if failure:
                 self._log_at(frame, "log", rr.TextLog(f"no inverse kinematics: {failure}", level="WARN"))
@@ -180,13 +182,15 @@ class EpisodeLog:
             self._log_at(frame, "log", rr.TextLog(where, level="WARN"))
             left = f"**At {times[frame]:.1f} s first {where}.**\n\n"
         happened = "".join(f"**{event} at {times[frame]:.1f} s.**\n\n" for frame, event in outcome.events)
+        noticed = outcome.noticed_in_words(self._env.task_spec.physics.control_period)
+        noticed = f"Noticed: {noticed}.\n\n" if noticed else ""
         verdict = "success" if outcome.success else f"failure: {outcome.unmet}"
         level = "INFO" if outcome.success else "ERROR"
         self._log_at(len(times) - 1, "log", rr.TextLog(verdict, level=level))
         self._stream.reset_time()
         text = (
             f"**{self._env.task}, seed {outcome.seed}: {verdict}**\n\n{left}"
-            f"{happened}Played: {' → '.join(outcome.primitives) or 'no primitives'}\n\n"
+            f"{happened}{noticed}Played: {' → '.join(outcome.primitives) or 'no primitives'}\n\n"
             f"Mean error against the expert: {outcome.position_error_cm:.2f} cm, {outcome.angle_error_rad:.3f} rad. "
             f"Inverse kinematics failed on {outcome.ik_failures} of {outcome.frames} frames."
         )

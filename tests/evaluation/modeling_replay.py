@@ -51,5 +51,5 @@ class ReplayPolicy(PreTrainedPolicy):
             probabilities={name: float(k == now) for k, name in enumerate(names)},
             plan=plan,
             attention={"left": 0.25, "table": 0.75},
-            events=(),
+            events=(f"{names[now]} begins",) if starts else (),
         )

@@ -209,11 +209,12 @@ def test_max_frames_below_the_horizon_are_refused() -> None:
 def test_going_on_keeps_what_was_played(checkpoint: Path, tmp_path: Path) -> None:
     job = job_of(checkpoint)
     journal = Journal(tmp_path / "eval", job.identity)
+    played = replace(outcome(SEED), events=((3, "push"),), noticed=((14, "grasp tried again"),))
     with journal.writing() as add:
-        add(outcome(SEED))
+        add(played)
     with (journal.folder / "outcomes.jsonl").open("a") as file:
         file.write('{"seed": 500001, "succ')  # killed in the middle of a line
-    assert Journal(tmp_path / "eval", job.identity).done == {SEED: outcome(SEED)}
+    assert Journal(tmp_path / "eval", job.identity).done == {SEED: played}
 
 
 def test_going_on_with_other_weights_is_refused(checkpoint: Path, tmp_path: Path) -> None:

@@ -42,6 +42,14 @@ def test_the_ending_is_told() -> None:
     assert (outcome.success, outcome.expert_success) == (True, False)
 
 
+def test_what_the_policy_noticed_is_told_by_frame() -> None:
+    explanations = [None, *(replace(explanation(k), events=words) for k, words in enumerate(((), ("a", "b"), ("a",))))]
+    outcome = score(trace((0, 0, 1, 2), explanations=explanations))
+    assert outcome.noticed == ((2, "a"), (2, "b"), (3, "a"))
+    assert outcome.noticed_in_words(0.1) == "a at 0.2 s, 0.3 s; b at 0.2 s"
+    assert (score(trace()).noticed, score(trace()).noticed_in_words(0.1)) == ((), "")
+
+
 def test_failures_of_inverse_kinematics_are_counted_by_frame() -> None:
     failing = replace(trace(), ik_failures=("", "left", "left, right", "", "", ""))
     assert score(failing).ik_failures == 2

@@ -217,12 +217,14 @@ def test_the_report_names_rows_pairs_and_motion() -> None:
 # -------------------------------------------------------------- an evaluation names events
 
 
-def test_a_report_names_each_event_at_its_time(tmp_path: Path) -> None:
+def test_a_report_names_each_event_and_what_the_policy_noticed_at_its_time(tmp_path: Path) -> None:
     run = Run("table_lift:push=1", "somewhere", (), 0, 2, None)
-    pushed = outcome(1, success=False, unmet="table upright", events=((3, "push: table (0.80 N s)"),))
+    noticed = ((14, "grasp tried again"), (20, "lift tried again"), (26, "grasp tried again"))
+    pushed = outcome(1, success=False, unmet="table upright", events=((3, "push: table (0.80 N s)"),), noticed=noticed)
     write_report(tmp_path, run, [outcome(0), pushed])
     lines = [[cell.strip() for cell in line.split("|")] for line in (tmp_path / "report.md").read_text().splitlines()]
-    assert ["", "1", "0.3", "push: table (0.80 N s)", "failure: table upright", ""] in lines
+    said = "grasp tried again at 1.4 s, 2.6 s; lift tried again at 2.0 s"
+    assert ["", "1", "push: table (0.80 N s) at 0.3 s", said, "failure: table upright", ""] in lines
     write_report(tmp_path, run, [outcome(0)])
     assert "## Events" not in (tmp_path / "report.md").read_text()
 

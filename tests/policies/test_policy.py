@@ -91,7 +91,7 @@ def test_policy_explains_itself(metadata) -> None:
             if told.plan is None:
                 assert told.events == ()
             else:
-                again = (f"{told.primitive} again",) if told.primitive in begun[row] else ()
+                again = (f"{told.primitive} tried again",) if told.primitive in begun[row] else ()
                 assert told.events == again
                 begun[row].add(told.primitive)
                 longest = policy.config.primitive_lengths[policy.config.primitives.index(told.primitive)][1]

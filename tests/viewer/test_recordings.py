@@ -82,7 +82,8 @@ def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path:
 
 def test_events_are_named_and_bodies_that_move_are_drawn_where_they_were(played, tmp_path: Path) -> None:
     env, trace, outcome = played
-    disturbed = replace(outcome, events=((12, "platform_slide: platform (0.05 m)"),))
+    noticed = ((14, "grasp tried again"), (26, "grasp tried again"))
+    disturbed = replace(outcome, events=((12, "platform_slide: platform (0.05 m)"),), noticed=noticed)
     slid = trace.poses["platform"].copy()
     slid[13:, 0] += 0.05
     moved = replace(trace, poses=trace.poses | {"platform": slid})
@@ -90,7 +91,10 @@ def test_events_are_named_and_bodies_that_move_are_drawn_where_they_were(played,
         tmp_path, EvaluatedEpisode(env, disturbed, moved, Reference.of(env.task_spec, moved, SUCCEEDED))
     )
     assert "platform_slide: platform (0.05 m)" in values_of(path, "/log", "TextLog:text")
-    assert "**platform_slide: platform (0.05 m) at 1.2 s.**" in value_of(path, "/summary", "TextDocument:text")
+    assert values_of(path, "/log", "TextLog:text").count("grasp tried again") == 2
+    summary = value_of(path, "/summary", "TextDocument:text")
+    assert "**platform_slide: platform (0.05 m) at 1.2 s.**" in summary
+    assert "Noticed: grasp tried again at 1.4 s, 2.6 s." in summary
     drawn = values_of(path, "/world/platform", "Transform3D:translation")
     assert len(drawn) == len(trace.state)
     assert drawn[-1][0] - drawn[0][0] == pytest.approx(0.05, abs=1e-6)

@@ -85,4 +85,4 @@ def _events(names: list[str], playback: PlaybackState, row: int) -> tuple[str, .
     """A primitive that begins for the second time or later."""
     playing = int(playback.primitive[row])
     again = int(playback.elapsed[row]) == 0 and int(playback.begun[row, playing]) > 1
-    return (f"{names[playing]} again",) if again else ()
+    return (f"{names[playing]} tried again",) if again else ()
