@@ -1,21 +1,19 @@
-"""Does a task tell good models from bad ones? Models of HDR-IL, and their linear maps alone, on scenes that vary.
+"""Does a task tell good models from bad ones? Models of HDR-IL, and linear maps alone, on scenes that vary.
 
 python scripts/separation.py                       trains and evaluates what is missing, then writes docs/separation.md and .json
 python scripts/separation.py --tasks table_lift    one task
 
 For each task: demonstrations at the level ``varied``, one training of each model on them, and the same held-out seeds for all.
-The linear maps are those of the model, whose networks then predict nothing. After Ctrl-C the same command continues.
+``linear`` has linear maps alone, once a primitive or at every frame. After Ctrl-C the same command continues.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
-from damage import leave_linear_maps
 from pairs import paired_p_value, summarise
 from stages import Stage, checkpoint, commit, evaluation_stage, record_stage, run_chains, train_stage
 
@@ -25,46 +23,31 @@ from hdril.markdown import table
 from hdril.tasks import TASKS
 
 MODELS: dict[str, tuple[str, ...]] = {
+    "linear": ("--policy.preset=linear",),
+    "linear_every_frame": ("--policy.preset=linear_every_frame",),
     "gru_gru": ("--policy.preset=gru_gru",),
     "hdril_paper": ("--policy.preset=hdril_paper",),
     "hdril": ("--policy.preset=hdril",),
-    "hdril, every frame": ("--policy.preset=hdril", "--policy.replan_every=1"),
+    "hdril_every_frame": ("--policy.preset=hdril", "--policy.replan_every=1"),
 }
-"""Models by the name of their row."""
-LINEAR = {"hdril": "linear maps", "hdril, every frame": "linear maps, every frame"}
-"""Rows of the models whose linear maps are tried alone."""
-
-
-def _folder(name: str) -> str:
-    return name.replace(", ", "_").replace(" ", "_")
+"""Models by the name of their row, weakest first as one would expect."""
 
 
 def training(task: str, options: argparse.Namespace) -> list[list[Stage]]:
     """The chains that train each model."""
     root = options.output / task
     return [
-        [train_stage(f"{task}, {name}", "train/table_lift", root / "dataset", root / _folder(name) / "train", options.steps,
+        [train_stage(f"{task}, {name}", "train/table_lift", root / "dataset", root / name / "train", options.steps,
                      f"--batch_size={options.batch_size}", *model)]
         for name, model in MODELS.items()
     ]  # fmt: skip
 
 
-def policies(task: str, options: argparse.Namespace) -> dict[str, Path]:
-    """Checkpoints by row, weakest first as one would expect. Makes the copies that have linear maps alone."""
-    root = options.output / task
-    found = {name: checkpoint(root / _folder(name) / "train", options.steps) for name in MODELS}
-    for name, row in LINEAR.items():
-        copy = root / _folder(row) / "policy"
-        shutil.rmtree(copy, ignore_errors=True)
-        leave_linear_maps(found[name], copy)
-        found[row] = copy
-    return {row: found[row] for row in (*LINEAR.values(), *MODELS)}
-
-
-def evaluation(task: str, name: str, policy: Path, options: argparse.Namespace) -> Stage:
+def evaluation(task: str, name: str, options: argparse.Namespace) -> Stage:
     """The held-out seeds of one row."""
-    output = options.output / task / _folder(name) / "eval"
-    return evaluation_stage(f"{task}, {name}", f"{task}:level=varied", policy, output, options.episodes, options.seed)
+    folder = options.output / task / name
+    policy, title = checkpoint(folder / "train", options.steps), f"{task}, {name}"
+    return evaluation_stage(title, f"{task}:level=varied", policy, folder / "eval", options.episodes, options.seed)
 
 
 def markdown(results: dict[str, Any]) -> str:
@@ -73,10 +56,9 @@ def markdown(results: dict[str, Any]) -> str:
         "# Which tasks tell models apart",
         f"{results['demonstrations']} demonstrations of scenes that vary (level `varied`), {results['steps']} steps of batch "
         f"{results['batch_size']}, {results['episodes']} held-out seeds from {results['seed']} on. Made by "
-        "`python scripts/separation.py`. Success in percent with the 95 % interval (Wilson). The linear maps are those of "
-        "`hdril`, with networks that predict nothing. Each model was trained once: an interval says how often this trained "
-        "policy succeeds, and not what another training gives. p is of McNemar's exact test against `hdril`, adjusted by "
-        "Holm's method.",
+        "`python scripts/separation.py`. Success in percent with the 95 % interval (Wilson). Each model was trained once: an "
+        "interval says how often this trained policy succeeds, and not what another training gives. p is of McNemar's exact test "
+        "against `hdril`, adjusted by Holm's method.",
     ]
     for task, entry in results["tasks"].items():
         rows, base = entry["rows"], entry["rows"]["hdril"]
@@ -120,7 +102,7 @@ def main() -> None:
         dataset = options.output / task / "dataset"
         run_chains([[record_stage(f"{task}:level=varied", "hdril/separation", dataset, options.demonstrations)]])
         run_chains(training(task, options), options.jobs)
-        stages = {name: evaluation(task, name, policy, options) for name, policy in policies(task, options).items()}
+        stages = {name: evaluation(task, name, options) for name in MODELS}
         run_chains([[stage] for stage in stages.values()], options.jobs)
         rows = {name: summarise(json.loads(stage.result.read_text())) for name, stage in stages.items()}
         results["tasks"][task] = {"commit": commit(), "rows": rows}

@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 from lerobot.policies.factory import make_policy
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from lerobot_policy_hdril import HDRILConfig, HDRILPolicy, companions
 from lerobot_policy_hdril.demonstrations import Demonstrations
 from lerobot_policy_hdril.presets import PRESETS
@@ -38,7 +39,10 @@ def test_variant_learns_saves_loads_and_runs(variant: str, metadata, tmp_path: P
     last = losses(policy)
     # Planner and dynamics share no parameter, so each has to learn by itself.
     assert last["planner_loss"] < 0.85 * first["planner_loss"]
-    assert last["dynamics_loss"] < 0.85 * first["dynamics_loss"]
+    if policy.config.decoder == "linear":  # the maps were solved before the first step
+        assert last["dynamics_loss"] == first["dynamics_loss"] < 0.3
+    else:
+        assert last["dynamics_loss"] < 0.85 * first["dynamics_loss"]
     assert set(last) == {"dynamics_loss", "latent_divergence", "planner_loss", "planner_accuracy"}
     assert (last["latent_divergence"] > 0) == (policy.config.latent == "variational")
     policy.save_pretrained(tmp_path / "checkpoint")
@@ -253,14 +257,36 @@ def test_one_primitive_and_one_episode_and_a_batch_of_one(copy: Path) -> None:
     assert all(action.shape == (1, 16) for action in actions)
 
 
+@pytest.mark.parametrize(
+    ("linear", "whole"),
+    [("linear", {}), ("linear_every_frame", {"replan_every": 1}), ("linear_reactive", {"preset": "hdril_reactive"})],
+)
+def test_linear_maps_alone_predict_what_the_whole_does_before_its_network_learns(linear: str, whole, metadata) -> None:
+    alone, whole = build(metadata, preset=linear).eval(), build(metadata, **{"preset": "hdril"} | whole).eval()
+    assert not list(alone.dynamics.parameters())
+    assert list(whole.dynamics.parameters())
+    state = torch.cat([observation(metadata, [5, 40])[key] for key in (OBS_STATE, OBS_ENV_STATE)], dim=-1)
+    primitive, elapsed = torch.tensor([0, 2]), torch.tensor([0, 0])
+    given = alone.plan(state, state, primitive, elapsed)
+    assert torch.equal(given, whole.plan(state, state, primitive, elapsed))
+    assert given.std() > 0.1
+
+
+@pytest.mark.parametrize("given", [{"state_skip": False}, {"latent": "variational"}, {"experts": "stacked"}])
+def test_linear_maps_alone_refuse_what_would_act_on_nothing(given) -> None:
+    with pytest.raises(ValueError, match=r"policy\.decoder=(linear needs|gru; got linear)"):
+        HDRILConfig(device="cpu", push_to_hub=False, decoder="linear", **given)
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_preset_is_what_its_name_says(preset: str) -> None:
     config = HDRILConfig(device="cpu", push_to_hub=False, preset=preset)
     for name, value in PRESETS[preset].items():
         assert getattr(config, name) == value
     assert (config.coordinates == "relational") == preset.endswith("_relational")
-    assert config.per_primitive == ("multi" in preset or preset.startswith("hdril"))
-    assert config.skip == (preset.startswith(("res", "hdril")))
+    assert config.per_primitive == ("multi" in preset or preset.startswith(("hdril", "linear")))
+    assert config.skip == (preset.startswith(("res", "hdril", "linear")))
+    assert (config.decoder == "linear") == preset.startswith("linear")
     assert (config.interaction == "none") == preset.startswith(("gru_gru", "res_", "res_multi")) or preset == "res"
 
 

@@ -17,7 +17,7 @@ from lerobot_policy_hdril.provenance import TrainingData
 from lerobot_policy_hdril.schema import SUBTASK_KEY
 
 Interaction = Literal["none", "scalar", "object"]
-Decoder = Literal["gru", "ode"]
+Decoder = Literal["gru", "ode", "linear"]
 Rollout = Literal["closed_loop", "open_loop"]
 Coordinates = Literal["absolute", "relational", "fused"]
 Latent = Literal["deterministic", "variational"]
@@ -61,6 +61,7 @@ class HDRILConfig(PreTrainedConfig):
     per_primitive: bool = True
     """One dynamics model per primitive (the paper's Multi), or one for all that is told the primitive."""
     decoder: Decoder = "gru"
+    """``ode``: the paper's other decoder. ``linear``: no network, the linear maps predict alone; a baseline for the others."""
     coordinates: Coordinates = "absolute"
     """Of the dynamics. ``relational``: hands and predictions in the frame of the first object, as it stands when a plan is
     made. ``fused``: the linear maps predict the next actions in the world's and every object's frame, and the predictions
@@ -167,9 +168,12 @@ class HDRILConfig(PreTrainedConfig):
             )
         if self.latent == "deterministic" and (self.kl_weight or self.samples):
             raise ValueError("policy.kl_weight and policy.samples are for policy.latent=variational")
-        if self.experts == "stacked" and self.decoder == "ode":
+        if self.experts == "stacked" and self.decoder != "gru":
+            raise ValueError(f"policy.experts=stacked works with policy.decoder=gru; got {self.decoder}")
+        if self.decoder == "linear" and not (self.state_skip and self.latent == "deterministic"):
             raise ValueError(
-                "policy.experts=stacked works with policy.decoder=gru: the ODE's solver cannot be batched so"
+                "policy.decoder=linear needs policy.state_skip=true and policy.latent=deterministic; "
+                f"got {self.state_skip} and {self.latent}"
             )
         if self.filter_frames > 1 and not self.state_skip:
             raise ValueError(

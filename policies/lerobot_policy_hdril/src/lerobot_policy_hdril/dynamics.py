@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from lerobot_policy_hdril.decoders import DECODERS, gru_step
-from lerobot_policy_hdril.interaction import make_interaction
+from lerobot_policy_hdril.interaction import NoInteraction, make_interaction
 
 FAR = 5.0
 """Medians of the distance from a robust fit, beyond which a demonstration is left out of it."""
@@ -142,7 +142,7 @@ class PrimitiveDynamics(nn.Module):
 
     f_t is the mean of the last states, with ``filtered``. ``context`` c is empty for a model of one primitive, and says which
     primitive it is for a model of all. L is there with ``state_skip``; with ``residual``, other maps stand in for it. Without
-    ``variational`` there is no v, and z = m.
+    ``variational`` there is no v, and z = m. With the decoder ``linear`` there is nothing but L, or the other maps.
     """
 
     def __init__(
@@ -163,6 +163,13 @@ class PrimitiveDynamics(nn.Module):
         residual: bool = False,
     ) -> None:
         super().__init__()
+        self.out_dim = out_dim
+        seen = 2 * len(names) if filtered else len(names)
+        self.state_skip = StateSkip(seen, out_dim, steps, stride) if state_skip else None
+        self.has_network = decoder != "linear"
+        if not self.has_network:
+            self.graph = NoInteraction(names, node_dim)
+            return
         self.graph = make_interaction(interaction, names, node_dim)
         self.register_buffer("skip_columns", torch.tensor(skip_columns, dtype=torch.long), persistent=False)
         self.encoder = nn.GRUCell(self.graph.out_dim, hidden_dim)
@@ -175,8 +182,6 @@ class PrimitiveDynamics(nn.Module):
         self.decoder = DECODERS[decoder](hidden_dim, steps)
         first, last = nn.Linear(2 * hidden_dim, hidden_dim), nn.Linear(hidden_dim, out_dim)
         self.head = nn.Sequential(first, nn.SiLU(), last)
-        seen = 2 * len(names) if filtered else len(names)
-        self.state_skip = StateSkip(seen, out_dim, steps, stride) if state_skip else None
         if state_skip or residual:  # the network starts from what the linear maps leave: nothing
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
@@ -203,6 +208,10 @@ class PrimitiveDynamics(nn.Module):
         Returns:
             Normalised actions and states (B, M, A + S), and KL(N(m, e^v) || N(0, 1)) (B,) in nats, 0 if deterministic.
         """
+        if not self.has_network:
+            output = normalised.new_zeros(*steps.shape, self.out_dim)
+            mapped = output if self.state_skip is None else self.state_skip(linear, steps)
+            return mapped, output.new_zeros(len(output))
         seen = self.graph(normalised, raw)
         if stacked:
             encoder, start = self.encoder, seen.new_zeros(len(seen), self.encoder.hidden_size)

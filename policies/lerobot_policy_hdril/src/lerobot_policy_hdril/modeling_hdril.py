@@ -360,7 +360,7 @@ class HDRILPolicy(PreTrainedPolicy):
         """Whether to call the models of a batch as one. On a CPU the products take as long either way and padding costs
         more; elsewhere many small calls cost more."""
         if self.config.experts == "auto":
-            if self.config.decoder == "ode" or primitive.device.type == "cpu":
+            if self.config.decoder != "gru" or primitive.device.type == "cpu":
                 return False
             return bool((primitive != primitive[0]).any())
         return self.config.experts == "stacked"

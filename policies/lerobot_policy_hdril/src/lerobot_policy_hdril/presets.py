@@ -39,6 +39,8 @@ def _presets() -> dict[str, dict[str, Any]]:
         "samples": 0,
         "hidden_dim": _MULTI_HIDDEN,
     }
+    every["linear"] = every["hdril"] | {"decoder": "linear"}
+    every["linear_every_frame"] = every["linear"] | {"replan_every": 1}
     every["hdril_reactive"] = every["hdril"] | {
         "coordinates": "fused",
         "termination": "learned",
@@ -46,6 +48,7 @@ def _presets() -> dict[str, dict[str, Any]]:
         "robust": True,
         "replan_every": 1,
     }
+    every["linear_reactive"] = every["hdril_reactive"] | {"decoder": "linear"}
     return every
 
 
