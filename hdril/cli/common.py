@@ -50,15 +50,23 @@ def _switches(arguments: list[str], config_class: type[Any]) -> list[str]:
     ]
 
 
-def run(program: str, config_class: type[Any], command: Callable[[Any], None]) -> None:
+def _named(arguments: list[str], positional: str) -> list[str]:
+    """``FOLDER`` as ``--dataset=FOLDER``, for a command whose first argument needs no name."""
+    if positional and arguments and not arguments[0].startswith("-"):
+        return [f"--{positional}={arguments[0]}", *arguments[1:]]
+    return arguments
+
+
+def run(program: str, config_class: type[Any], command: Callable[[Any], None], positional: str = "") -> None:
     """Parse the command line and run ``command``; a failure that a user can mend is one line and exit code 2.
 
+    ``positional`` is the option whose value may stand first, without its name.
     ``HDRIL_DEBUG=1`` shows the traceback instead. Any other exception is a bug: it keeps its traceback, and the exit code is 1.
     Ctrl-C exits with 130.
     """
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     try:
-        arguments = [_with_underscores(argument) for argument in sys.argv[1:]]
+        arguments = [_with_underscores(argument) for argument in _named(sys.argv[1:], positional)]
         command(draccus.parse(config_class, args=_switches(arguments, config_class)))
     except KeyboardInterrupt:
         print(f"\n{program}: interrupted", file=sys.stderr)

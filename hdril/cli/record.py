@@ -12,6 +12,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from hdril import __version__
+from hdril.cli.check import CheckConfig, check_command
 from hdril.cli.common import check_repo_id, run
 from hdril.demonstrations.provenance import Recipe, read_provenance
 from hdril.demonstrations.record import record
@@ -48,6 +49,9 @@ class RecordConfig:
     """Processes that simulate. The dataset is the same for any number."""
     noise: Noise = field(default_factory=Noise)
     """Noise of the demonstrations."""
+    verify: Path | None = None
+    """Record nothing: make num_episodes episodes of the dataset in this folder again, spread over it (all if it has no more), and
+    compare them bit for bit. hdril-check does this and checks the rest, too."""
     push: bool = False
     """Publish the dataset on the Hugging Face Hub under repo_id, with a card. If it is at root already and is what these
     options make, it is published without recording anew."""
@@ -56,7 +60,10 @@ class RecordConfig:
 
 
 def record_command(config: RecordConfig) -> None:
-    """Record, and publish if asked to."""
+    """Record, and publish if asked to; or verify what is recorded."""
+    if config.verify is not None:
+        _verify(config.verify, config)
+        return
     if config.repo_id is not None:
         check_repo_id("repo_id", config.repo_id)
     elif config.push:
@@ -119,6 +126,14 @@ def _record(recipe: Recipe, config: RecordConfig, root: Path) -> None:
     )
     for seed, why in made.dropped.items():
         print(f"  dropped seed {seed}: {why}")
+
+
+def _verify(dataset: Path, config: RecordConfig) -> None:
+    if config.push or config.root is not None:
+        raise ValueError("--verify records nothing: leave out --push and --root")
+    if config.num_episodes < 1 or config.workers < 1:
+        raise ValueError(f"num_episodes and workers must be at least 1, got {config.num_episodes} and {config.workers}")
+    check_command(CheckConfig(dataset, str(config.num_episodes), workers=config.workers))
 
 
 def _check_same(root: Path, recipe: Recipe, config: RecordConfig) -> None:

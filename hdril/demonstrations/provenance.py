@@ -64,12 +64,17 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Provenance:
-    """How a dataset was made: its recipe, the seeds of its episodes in order, and why which seeds were dropped."""
+    """How a dataset was made: its recipe, the seeds of its episodes in order, and why which seeds were dropped.
+
+    ``digest`` is that of its episodes (:func:`~hdril.demonstrations.content.dataset_digest`), empty before they are written and
+    for datasets of before there were digests.
+    """
 
     recipe: Recipe
     seeds: tuple[int, ...]
     dropped: dict[int, str] = field(default_factory=dict)
     hdril_version: str = __version__
+    digest: str = ""
 
     @property
     def first_seed(self) -> int:
@@ -96,6 +101,7 @@ def write_provenance(root: Path, provenance: Provenance) -> None:
         "recipe": provenance.recipe_values,
         "seeds": list(provenance.seeds),
         "dropped": {str(seed): why for seed, why in provenance.dropped.items()},
+        "digest": provenance.digest,
     }
     (root / RECIPE_PATH).write_text(json.dumps(values, indent=2))
 
@@ -118,7 +124,9 @@ def read_provenance(root: Path) -> Provenance | None:
 
 
 def _provenance(values: object) -> Provenance:
-    told = _named(values, "", ("recipe", "seeds", "dropped"))
+    if isinstance(values, dict):
+        values = {"digest": ""} | values
+    told = _named(values, "", ("recipe", "seeds", "dropped", "digest"))
     since = {"perturb": 0.0}  # fields that datasets of earlier versions do not have
     recipe = since | told["recipe"] if isinstance(told["recipe"], dict) else told["recipe"]
     recipe = _named(recipe, "recipe", (*(entry.name for entry in fields(Recipe)), "hdril_version"))
@@ -137,7 +145,9 @@ def _provenance(values: object) -> Provenance:
         robot=recipe["robot"],
         perturb=recipe["perturb"],
     )
-    return Provenance(made, tuple(seeds), {int(seed): why for seed, why in dropped.items()}, recipe["hdril_version"])
+    _check_type(told["digest"], "", "digest")
+    why = {int(seed): reason for seed, reason in dropped.items()}
+    return Provenance(made, tuple(seeds), why, recipe["hdril_version"], told["digest"])
 
 
 def _named(values: object, where: str, names: Iterable[str]) -> dict[str, Any]:

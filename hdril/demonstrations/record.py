@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import Future
 from contextlib import closing
 from functools import cache
@@ -40,17 +40,20 @@ def _work(recipe: Recipe, seed: int) -> Episode:
 
 
 def episodes(recipe: Recipe, first_seed: int, workers: int = 1) -> Generator[Episode]:
-    """Demonstrations of seeds ``first_seed``, + 1, + 2, … up to :data:`~hdril.files.MAX_SEED`, in this order whatever the
-    number of workers.
+    """Demonstrations of seeds ``first_seed``, + 1, + 2, … up to :data:`~hdril.files.MAX_SEED`, as :func:`play` gives them."""
+    return play(recipe, range(first_seed, MAX_SEED + 1), workers)
+
+
+def play(recipe: Recipe, seeds: Iterable[int], workers: int = 1) -> Generator[Episode]:
+    """Demonstrations of these seeds, in this order whatever the number of workers.
 
     Close the iterator when you have enough.
 
     Raises:
         UserError: a worker process died.
     """
-    seeds = iter(range(first_seed, MAX_SEED + 1))
     if workers > 1:
-        yield from _in_parallel(recipe, seeds, workers)
+        yield from _in_parallel(recipe, iter(seeds), workers)
         return
     env, expert = recipe.make_env(), recipe.make_expert()
     with closing(env):
@@ -106,7 +109,7 @@ def record(
             selection = _Selection(num_episodes, progress)
             _fill(selection, shards, lambda seed: episodes(recipe, seed, workers), first_seed)
             provenance = Provenance(recipe, tuple(episode.seed for episode in selection.kept), selection.dropped)
-            _publish(provenance, selection.kept, partial, root)
+            provenance = _publish(provenance, selection.kept, partial, root)
         except BaseException as error:
             if isinstance(error, ExpertError) or not any(partial.glob("*.npz")):
                 shutil.rmtree(partial)  # there is nothing to go on from
@@ -160,11 +163,12 @@ def _fill(selection: _Selection, shards: Shards, stream: Callable[[int], Generat
     raise ValueError(f"only {len(selection.kept)} demonstrations succeeded up to the largest seed; choose a lower seed")
 
 
-def _publish(provenance: Provenance, kept: list[Episode], partial: Path, root: Path) -> None:
-    """Write the dataset beside its place and move it there when it is whole."""
+def _publish(provenance: Provenance, kept: list[Episode], partial: Path, root: Path) -> Provenance:
+    """Write the dataset beside its place and move it there when it is whole; returns its provenance with its digest."""
     staged = partial / "dataset"
     shutil.rmtree(staged, ignore_errors=True)
-    write_dataset(staged, provenance, kept)
+    provenance = write_dataset(staged, provenance, kept)
     root.parent.mkdir(parents=True, exist_ok=True)
     staged.replace(root)
     shutil.rmtree(partial, ignore_errors=True)
+    return provenance

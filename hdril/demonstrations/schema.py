@@ -27,6 +27,8 @@ SEED = "seed"
 """Column of ``meta/episodes``: the seed of the episode."""
 SCENARIO = "scenario"
 """Column of ``meta/episodes``: the scene and its events, as JSON (:class:`hdril.tasks.scenario.Scenario`)."""
+DIGEST = "digest"
+"""Column of ``meta/episodes``: :func:`hdril.demonstrations.content.episode_digest`."""
 
 SUBTASKS_PATH = "meta/subtasks.parquet"
 """Names of the primitives, by label."""
@@ -35,6 +37,7 @@ PROPORTIONS_PATH = "meta/temporal_proportions_dense.json"
 
 __all__ = [
     "ACTION",
+    "DIGEST",
     "DONE",
     "ENVIRONMENT_STATE",
     "PROPORTIONS_PATH",

@@ -47,6 +47,9 @@ class Options:
         (["hdril-eval", "--policy.path=x/y", "--num_episodes=0"], "num_episodes must be at least 1, got 0"),
         (["hdril-eval", "--policy.path=x/y", "--rerun=some"], "rerun must be failures, all, none or a number"),
         (["hdril-bench", "--task=chess"], "unknown task 'chess'; choose from: "),
+        (["hdril-check", "no/such/place"], "no/such/place is no LeRobot dataset: it has no meta/info.json"),
+        (["hdril-check", "x", "--remake=some"], "remake must be a number of episodes or all, got 'some'"),
+        (["hdril-check"], "`dataset`"),
         (["hdril-view"], "give either --run (an evaluation) or --dataset"),
     ],
 )
@@ -176,7 +179,13 @@ def test_names_that_the_hub_takes_pass(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("command", "option"),
-    [("hdril-record", "--task"), ("hdril-eval", "--task"), ("hdril-bench", "--task"), ("hdril-view", "--against")],
+    [
+        ("hdril-record", "--task"),
+        ("hdril-eval", "--task"),
+        ("hdril-check", "--remake"),
+        ("hdril-bench", "--task"),
+        ("hdril-view", "--against"),
+    ],
 )
 def test_help(command: str, option: str) -> None:
     text = succeed(command, "--help")

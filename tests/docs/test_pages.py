@@ -16,6 +16,7 @@ import yaml
 
 import hdril
 from hdril.cli.bench import BenchConfig
+from hdril.cli.check import CheckConfig
 from hdril.cli.eval import EvalConfig
 from hdril.cli.record import RecordConfig
 from hdril.cli.view import ViewConfig
@@ -28,6 +29,7 @@ FOLDERS = ("docs", "datasets", "policies")
 PAGES = sorted([*ROOT.glob("*.md"), *(page for folder in FOLDERS for page in (ROOT / folder).rglob("*.md"))])
 COMMANDS = {
     "hdril-record": RecordConfig,
+    "hdril-check": CheckConfig,
     "hdril-eval": EvalConfig,
     "hdril-view": ViewConfig,
     "hdril-bench": BenchConfig,
@@ -77,7 +79,7 @@ def test_commands_have_the_options_that_the_page_gives_them(page: Path) -> None:
 
 def test_commands_are_found_in_pages() -> None:
     found = {words[0] for page in PAGES for words in _command_lines(page.read_text())}
-    assert {"hdril-record", "hdril-eval", "hdril-view"} <= found
+    assert {"hdril-record", "hdril-check", "hdril-eval", "hdril-view"} <= found
 
 
 @each_page
