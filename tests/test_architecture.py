@@ -13,7 +13,7 @@ import hdril
 PACKAGE = Path(hdril.__file__).parent
 POLICY = PACKAGE.parent / "policies" / "lerobot_policy_hdril" / "src" / "lerobot_policy_hdril"
 
-BOTTOM = {"digest", "errors", "files", "geometry", "markdown", "plugins", "workers"}
+BOTTOM = {"digest", "errors", "execution", "files", "geometry", "markdown", "plugins", "workers"}
 """Modules that know nothing of robots and tasks. Every room may import them, and they import only one another."""
 
 BELOW: dict[str, set[str]] = {name: set() for name in BOTTOM} | {

@@ -6,7 +6,10 @@ import json
 import os
 import re
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from tqdm import tqdm
@@ -15,7 +18,8 @@ from hdril import __version__
 from hdril.cli.check import CheckConfig, check_command
 from hdril.cli.common import check_repo_id, run
 from hdril.demonstrations.provenance import Recipe, read_provenance
-from hdril.demonstrations.record import record
+from hdril.demonstrations.record import check_numbers, partial_folder, record, record_shard, refuse_existing
+from hdril.execution import SlurmConfig, check_execution, run_on_ray, submit_to_slurm
 from hdril.tasks import ANY_EVENT, TASKS, base_name
 from hdril.tasks.primitives import Noise
 
@@ -47,6 +51,16 @@ class RecordConfig:
     outputs/<task>/dataset."""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Processes that simulate. The dataset is the same for any number."""
+    shards: int = 1
+    """Shares of the seeds that are played apart: by executor, or one by one with shard. They do not change the dataset."""
+    shard: int | None = None
+    """Play this share of the seeds alone, from 0 to shards - 1, and end. The same command without it plays what is missing and
+    makes the dataset: for clusters that hdril does not know. The disk must be shared."""
+    executor: str = "local"
+    """Who plays the shards: local, this machine; slurm, jobs of a Slurm cluster, and this command ends when they are
+    submitted; ray, a Ray cluster. On a cluster, workers is how many shards play at once."""
+    slurm: SlurmConfig = field(default_factory=SlurmConfig)
+    """What the jobs of --executor=slurm may take."""
     noise: Noise = field(default_factory=Noise)
     """Noise of the demonstrations."""
     verify: Path | None = None
@@ -68,11 +82,24 @@ def record_command(config: RecordConfig) -> None:
         check_repo_id("repo_id", config.repo_id)
     elif config.push:
         raise ValueError("--push needs --repo_id: the name of the dataset on the Hub, as user/name")
+    check_execution(config.executor, config.shards, config.slurm)
+    if config.push and (config.shard is not None or config.executor == "slurm"):
+        raise ValueError("--push comes when the dataset is whole: give it without --shard and --executor=slurm")
+    if config.shard is not None and config.executor != "local":
+        raise ValueError(f"--shard plays here: leave out --executor={config.executor}")
     recipe = Recipe(with_events(config.task, config.events), config.noise, perturb=config.perturb)
     root = config.root or default_root(recipe.task, config.repo_id)
     if config.push and root.exists():
         _check_same(root, recipe, config)
+    elif config.shard is not None:
+        _record_shard(recipe, config, root)
+        return
+    elif config.executor == "slurm":
+        _submit(recipe, config, root)
+        return
     else:
+        if config.executor == "ray":
+            _record_on_ray(recipe, config, root)
         _record(recipe, config, root)
     if config.push and config.repo_id is not None:
         _push(config.repo_id, config, root)
@@ -105,20 +132,61 @@ def default_root(task: str, repo_id: str | None) -> Path:
     return HF_LEROBOT_HOME / repo_id
 
 
-def _record(recipe: Recipe, config: RecordConfig, root: Path) -> None:
-    start = time.monotonic()
-    with tqdm(total=max(config.num_episodes, 0), desc=f"recording {config.task}", unit="episode") as bar:
+def _record_shard(recipe: Recipe, config: RecordConfig, root: Path) -> None:
+    shard, shards = config.shard or 0, config.shards
+    with _progress_bar(f"recording {config.task}, shard {shard}", config.num_episodes // shards) as progress:
+        record_shard(recipe, config.num_episodes, config.seed, root, shard, shards, config.workers, progress)
+    print(f"Shard {shard} of {shards} is in {partial_folder(root)}; the same command without --shard makes the dataset")
+
+
+def _shares(recipe: Recipe, config: RecordConfig, root: Path) -> Callable[[int, int], None]:
+    """What a cluster does, checked as far as it can be here."""
+    check_numbers(config.num_episodes, config.seed, config.workers)
+    refuse_existing(root)
+    return partial(record_shard, recipe, config.num_episodes, config.seed, root.resolve())
+
+
+def _record_on_ray(recipe: Recipe, config: RecordConfig, root: Path) -> None:
+    run_on_ray(_shares(recipe, config, root), config.shards, config.workers, _logs(root))
+
+
+def _submit(recipe: Recipe, config: RecordConfig, root: Path) -> None:
+    work, finish = (
+        _shares(recipe, config, root),
+        partial(record, recipe, config.num_episodes, config.seed, root.resolve()),
+    )
+    array, last = submit_to_slurm(
+        work, finish, "hdril_record", config.shards, config.workers, config.slurm, _logs(root)
+    )
+    print(f"Submitted {config.shards} shards as job {array}; job {last} then makes {root}")
+    print(f"Logs: {_logs(root)}; after a failure, the same command plays what is missing")
+
+
+def _logs(root: Path) -> Path:
+    """Beside the dataset: what is in the partial one is removed when the dataset is whole."""
+    return root.with_name(root.name + ".jobs")
+
+
+@contextmanager
+def _progress_bar(title: str, total: int) -> Iterator[Callable[[int, int], None]]:
+    """Gives a function that shows the numbers of kept and dropped episodes."""
+    with tqdm(total=max(total, 0), desc=title, unit="episode") as bar:
 
         def progress(kept: int, dropped: int) -> None:
             bar.set_postfix(dropped=dropped, refresh=False)
             bar.update(kept - bar.n)
 
-        try:
+        yield progress
+
+
+def _record(recipe: Recipe, config: RecordConfig, root: Path) -> None:
+    start = time.monotonic()
+    try:
+        with _progress_bar(f"recording {config.task}", config.num_episodes) as progress:
             made = record(recipe, config.num_episodes, config.seed, root, config.workers, progress)
-        except KeyboardInterrupt:
-            bar.close()
-            print(f"\nStopped; nothing was written to {root}. Run the same command again to go on.")
-            raise
+    except KeyboardInterrupt:
+        print(f"\nStopped; nothing was written to {root}. Run the same command again to go on.")
+        raise
     tried = len(made.seeds) + len(made.dropped)
     print(
         f"{len(made.seeds)} episodes (seeds {made.seeds[0]} to {made.seeds[-1]}) in {root}, "

@@ -18,6 +18,7 @@ from hdril.demonstrations.shards import Shards
 from hdril.demonstrations.write import write_dataset
 from hdril.env import BimanualEnv
 from hdril.errors import UserError
+from hdril.execution import share
 from hdril.files import MAX_SEED, exclusively
 from hdril.workers import worker_pool
 
@@ -94,17 +95,12 @@ def record(
         ExpertError: the expert fails more often than it succeeds.
         BusyError: another process records to ``root``.
     """
-    if num_episodes < 1:
-        raise ValueError(f"num_episodes must be at least 1, got {num_episodes}")
-    if not 0 <= first_seed <= MAX_SEED - num_episodes:
-        raise ValueError(f"seed must be from 0 to {MAX_SEED - num_episodes}, got {first_seed}")
-    if workers < 1:
-        raise ValueError(f"workers must be at least 1, got {workers}")
-    _refuse_existing(root)
-    partial = root.with_name(root.name + ".partial")
+    check_numbers(num_episodes, first_seed, workers)
+    refuse_existing(root)
+    partial = partial_folder(root)
     with exclusively(partial, f"recording to {root}"):
         try:
-            _refuse_existing(root)  # the process that held the lock until now may have finished it
+            refuse_existing(root)  # the process that held the lock until now may have finished it
             shards = Shards(partial, recipe, first_seed)
             selection = _Selection(num_episodes, progress)
             _fill(selection, shards, lambda seed: episodes(recipe, seed, workers), first_seed)
@@ -117,7 +113,54 @@ def record(
     return provenance
 
 
-def _refuse_existing(root: Path) -> None:
+def record_shard(
+    recipe: Recipe,
+    num_episodes: int,
+    first_seed: int,
+    root: Path,
+    shard: int,
+    shards: int,
+    workers: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Play the ``shard``-th of ``shards`` shares of ``num_episodes`` seeds from ``first_seed`` on, and keep the episodes.
+
+    They are kept where :func:`record` with the same arguments finds them. It plays what is missing, and makes the dataset.
+    Any number of shards may be played at once, on machines that share the disk. A seed that was played is not played again.
+    ``progress`` is called with the numbers of successful and failed episodes.
+
+    Raises:
+        FileExistsError, ValueError: as :func:`record`; there is no such shard.
+        ExpertError: the expert fails more often than it succeeds.
+    """
+    check_numbers(num_episodes, first_seed, workers)
+    seeds = share(range(first_seed, first_seed + num_episodes), shard, shards)
+    refuse_existing(root)
+    kept = Shards(partial_folder(root), recipe, first_seed)
+    selection = _Selection(num_episodes, progress)
+    with closing(play(recipe, [seed for seed in seeds if not kept.path(seed).exists()], workers)) as fresh:
+        for episode in fresh:
+            kept.put(episode)
+            selection.add(episode)
+
+
+def check_numbers(num_episodes: int, first_seed: int, workers: int) -> None:
+    """Raises ValueError unless so many episodes can be recorded from a seed on."""
+    if num_episodes < 1:
+        raise ValueError(f"num_episodes must be at least 1, got {num_episodes}")
+    if not 0 <= first_seed <= MAX_SEED - num_episodes:
+        raise ValueError(f"seed must be from 0 to {MAX_SEED - num_episodes}, got {first_seed}")
+    if workers < 1:
+        raise ValueError(f"workers must be at least 1, got {workers}")
+
+
+def partial_folder(root: Path) -> Path:
+    """Where the dataset of ``root`` lives until it is whole."""
+    return root.with_name(root.name + ".partial")
+
+
+def refuse_existing(root: Path) -> None:
+    """Raises FileExistsError if there is something at ``root``."""
     if root.exists():
         raise FileExistsError(f"{root} exists; choose another root or delete it")
 

@@ -1,0 +1,137 @@
+"""Work in shards: shares of seeds, and the clusters that play them."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from hdril.demonstrations.provenance import Provenance, Recipe, read_provenance
+from hdril.demonstrations.record import partial_folder, record, record_shard
+from hdril.errors import UserError
+from hdril.execution import SlurmConfig, check_execution, run_on_ray, share
+
+COUNT = 5
+RECIPE = Recipe("table_lift")
+
+
+@pytest.mark.parametrize("shards", [1, 2, 3, 7, 10, 13])
+def test_shares_are_the_whole_in_order_and_alike(shards: int) -> None:
+    seeds = range(100, 110)
+    shares = [share(seeds, shard, shards) for shard in range(shards)]
+    assert [seed for each in shares for seed in each] == list(seeds)
+    assert max(map(len, shares)) - min(map(len, shares)) <= 1
+
+
+@pytest.mark.parametrize("shard", [-1, 3])
+def test_a_share_that_there_is_not(shard: int) -> None:
+    with pytest.raises(ValueError, match=f"shard must be from 0 to 2, got {shard}"):
+        share(range(10), shard, 3)
+
+
+def test_what_is_missing_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    check_execution("local", 1, SlurmConfig())
+    with pytest.raises(ValueError, match="executor must be local, slurm, ray, got 'lsf'"):
+        check_execution("lsf", 1, SlurmConfig())
+    with pytest.raises(ValueError, match="shards must be at least 1, got 0"):
+        check_execution("local", 0, SlurmConfig())
+    with pytest.raises(ValueError, match=r"--executor=slurm needs --slurm\.partition"):
+        check_execution("slurm", 2, SlurmConfig())
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(UserError, match="--executor=slurm needs Slurm's sbatch, which is not on the PATH"):
+        check_execution("slurm", 2, SlurmConfig(partition="all"))
+    monkeypatch.setattr("hdril.execution.find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"--executor=ray needs Ray, the extra ray of hdril"):
+        check_execution("ray", 2, SlurmConfig())
+
+
+# --------------------------------------------------------------------- recording
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Provenance:
+    """What one process records."""
+    return record(RECIPE, COUNT, 50, tmp_path_factory.mktemp("alone") / "set")
+
+
+def test_shards_in_any_order_and_number_make_the_same_dataset(alone: Provenance, tmp_path: Path, monkeypatch) -> None:
+    root = tmp_path / "set"
+    record_shard(RECIPE, COUNT, 50, root, 2, 3)
+    record_shard(RECIPE, COUNT, 50, root, 0, 2)
+    kept = sorted(path.name for path in partial_folder(root).glob("*.npz"))
+    assert kept == ["50.npz", "51.npz", "53.npz", "54.npz"]
+    played: list[int] = []
+    record_shard(RECIPE, COUNT, 50, root, 1, 3, progress=lambda kept, dropped: played.append(kept))
+    assert played == [1], "51 was there already"
+    monkeypatch.setattr("hdril.demonstrations.record.demonstrate", None)  # nothing is left to be played
+    made = record(RECIPE, COUNT, 50, root)
+    assert made == alone == read_provenance(root)
+    assert made.digest
+    assert not partial_folder(root).exists()
+
+
+def test_what_shards_left_is_played(alone: Provenance, tmp_path: Path) -> None:
+    root = tmp_path / "set"
+    record_shard(RECIPE, COUNT, 50, root, 1, 2)
+    (partial_folder(root) / "53.npz").write_bytes(b"half")
+    assert record(RECIPE, COUNT, 50, root) == alone
+
+
+def test_a_shard_refuses_what_the_whole_refuses(alone: Provenance, tmp_path: Path) -> None:
+    root = tmp_path / "set"
+    record_shard(RECIPE, COUNT, 50, root, 4, 5)
+    with pytest.raises(ValueError, match="holds episodes of another recipe"):
+        record_shard(Recipe("table_lift", perturb=0.001), COUNT, 50, root, 4, 5)
+    with pytest.raises(ValueError, match="num_episodes must be at least 1"):
+        record_shard(RECIPE, 0, 50, tmp_path / "other", 0, 1)
+    root.mkdir()
+    with pytest.raises(FileExistsError, match="choose another root or delete it"):
+        record_shard(RECIPE, COUNT, 50, root, 0, 1)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["set", "set.partial"]
+
+
+# --------------------------------------------------------------------- real clusters
+
+
+def _record(root: Path, *options: str) -> str:
+    command = [Path(sys.executable).with_name("hdril-record"), "--task=table_lift", f"--num_episodes={COUNT}",
+               "--seed=50", f"--root={root}", "--workers=2", *options]  # fmt: skip
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
+@pytest.mark.long
+def test_ray_makes_the_same_dataset(alone: Provenance, tmp_path: Path) -> None:
+    pytest.importorskip("ray", reason="Ray is an extra")
+    _record(tmp_path / "set", "--executor=ray", "--shards=3")
+    assert read_provenance(tmp_path / "set") == alone
+
+
+def _break(rank: int, world_size: int) -> None:
+    if rank == 1:
+        raise ValueError("this shard cannot be done")
+
+
+@pytest.mark.long
+def test_ray_says_which_shards_failed(tmp_path: Path) -> None:
+    pytest.importorskip("ray", reason="Ray is an extra")
+    with pytest.raises(UserError, match=r"1 of 2 shards failed, the first is 1; their logs: .*/logs"):
+        run_on_ray(_break, 2, 1, tmp_path)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(shutil.which("sinfo") is None, reason="there is no Slurm here")
+def test_slurm_makes_the_same_dataset(alone: Provenance, tmp_path: Path) -> None:
+    listed = subprocess.run(["sinfo", "-h", "-o", "%R"], capture_output=True, text=True, check=False)
+    if listed.returncode or not listed.stdout.split():
+        pytest.skip("there is no Slurm here that answers")
+    root, partition = tmp_path / "set", listed.stdout.split()[0]
+    said = _record(root, "--executor=slurm", "--shards=3", f"--slurm.partition={partition}", "--slurm.mem_per_cpu_gb=1")
+    assert "Submitted 3 shards as job " in said
+    waiting = time.monotonic() + 300
+    while not root.exists() and time.monotonic() < waiting:
+        time.sleep(1)
+    assert read_provenance(root) == alone
