@@ -18,7 +18,7 @@ ALL = "all"
 
 @dataclass
 class CheckConfig:
-    """Check a LeRobot dataset of states with labelled primitives: hdril-check DATASET, with these options.
+    """Check a LeRobot dataset of states whose primitives are labelled in subtask_index: hdril-check DATASET, then options.
 
     Schema, numbering, finite numbers, unit quaternions, openings, reach, labels, success, and where hdril recorded it, digests.
     Says what is wrong, in which episode and at which frame. The exit code is 0 if nothing is, 1 if something is.
@@ -27,8 +27,8 @@ class CheckConfig:
     dataset: Path
     """Folder of the dataset; --dataset= may be left out."""
     remake: str = "0"
-    """How many episodes to make again from recipe and seed and to compare bit for bit, or all. Only on the kind of machine that
-    recorded them are the bits the same."""
+    """How many episodes to make again from recipe and seed and to compare number for number, or all. Only on the kind of
+    machine that recorded them are the numbers the same."""
     show: int = 20
     """How many findings to print; the others are counted."""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
@@ -49,13 +49,15 @@ def check_command(config: CheckConfig) -> None:
     print(f"{config.dataset}: nothing is wrong")
 
 
-def report(dataset: Path, made_again: int | None, workers: int, show: int = 20) -> int:
+def report(dataset: Path, made_again: int | None, workers: int, show: int) -> int:
     """Print the first ``show`` findings, and return how many there are."""
-    count = 0
+    count, stage = 0, ""
     with tqdm(unit="episode") as bar:
 
         def progress(doing: str, done: int, total: int) -> None:
-            if bar.desc != f"{doing}: ":
+            nonlocal stage
+            if doing != stage:
+                stage = doing
                 bar.reset(total)
                 bar.set_description(doing)
             bar.update(done - bar.n)

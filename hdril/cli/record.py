@@ -8,9 +8,10 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
@@ -64,8 +65,8 @@ class RecordConfig:
     noise: Noise = field(default_factory=Noise)
     """Noise of the demonstrations."""
     verify: Path | None = None
-    """Record nothing: make num_episodes episodes of the dataset in this folder again, spread over it (all if it has no more), and
-    compare them bit for bit. hdril-check does this and checks the rest, too."""
+    """Record nothing: make num_episodes episodes of the dataset in this folder again, spread over it (all if it has no more),
+    compare them number for number, and check the rest as hdril-check does."""
     push: bool = False
     """Publish the dataset on the Hugging Face Hub under repo_id, with a card. If it is at root already and is what these
     options make, it is published without recording anew."""
@@ -197,11 +198,16 @@ def _record(recipe: Recipe, config: RecordConfig, root: Path) -> None:
 
 
 def _verify(dataset: Path, config: RecordConfig) -> None:
-    if config.push or config.root is not None:
-        raise ValueError("--verify records nothing: leave out --push and --root")
-    if config.num_episodes < 1 or config.workers < 1:
-        raise ValueError(f"num_episodes and workers must be at least 1, got {config.num_episodes} and {config.workers}")
+    acting = ("verify", "num_episodes", "workers")
+    if idle := [option.name for option in fields(config) if option.name not in acting and _is_given(config, option)]:
+        raise ValueError(f"--verify records nothing: leave out {', '.join(idle)}")
+    check_numbers(config.num_episodes, 0, config.workers)
     check_command(CheckConfig(dataset, str(config.num_episodes), workers=config.workers))
+
+
+def _is_given(config: RecordConfig, option: Field[Any]) -> bool:
+    default = option.default if option.default_factory is MISSING else option.default_factory()
+    return getattr(config, option.name) != default
 
 
 def _check_same(root: Path, recipe: Recipe, config: RecordConfig) -> None:

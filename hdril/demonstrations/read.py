@@ -52,6 +52,27 @@ class StoredEpisode:
         return self.signals[ACTION].values
 
 
+def read_info(root: Path) -> dict[str, Any]:
+    """What ``meta/info.json`` of a dataset says.
+
+    Raises:
+        FileNotFoundError: there is no dataset at ``root``.
+        ValueError: the file is damaged, or of another format than LeRobot's version 3; names it.
+    """
+    path = root / "meta/info.json"
+    if not path.exists():
+        raise FileNotFoundError(f"{root} is no LeRobot dataset: it has no meta/info.json")
+    try:
+        info = json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
+    if missing := [name for name in ("codebase_version", "features", "fps", "total_episodes") if name not in info]:
+        raise ValueError(f"{path} has no {missing[0]}")
+    if not str(info["codebase_version"]).startswith("v3."):
+        raise ValueError(f"{path} is of LeRobot's format {info['codebase_version']}; hdril reads v3.0")
+    return info
+
+
 def read_episode(root: Path, episode: int) -> StoredEpisode:
     """The frames of an episode, in order.
 
@@ -61,9 +82,7 @@ def read_episode(root: Path, episode: int) -> StoredEpisode:
     """
     import pandas as pd
 
-    if not (root / "meta/info.json").exists():
-        raise FileNotFoundError(f"{root} is no LeRobot dataset: it has no meta/info.json")
-    info = json.loads((root / "meta/info.json").read_text())
+    info = read_info(root)
     frames = pd.read_parquet(root / "data", filters=[("episode_index", "==", episode)]).sort_values("frame_index")
     if frames.empty:
         raise ValueError(f"{root} has no episode {episode}; its episodes are 0 to {info['total_episodes'] - 1}")
