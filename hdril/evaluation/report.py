@@ -10,7 +10,7 @@ from typing import Any
 
 from hdril.evaluation.picture import draw
 from hdril.evaluation.results import Comparison, Run, headline, summarise
-from hdril.evaluation.score import DEPARTURE, Outcome
+from hdril.evaluation.score import DEPARTURE, Outcome, in_words
 from hdril.markdown import table
 from hdril.tasks import get_task
 
@@ -131,8 +131,8 @@ def _events(eventful: Sequence[Outcome], period: float) -> list[str]:
     rows = [
         [
             outcome.seed,
-            "; ".join(f"{event} at {period * frame:.1f} s" for frame, event in outcome.events),
-            outcome.noticed_in_words(period),
+            in_words(outcome.events, period),
+            in_words(outcome.noticed, period),
             "success" if outcome.success else f"failure: {outcome.unmet}",
         ]
         for outcome in eventful

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -70,12 +71,13 @@ class Outcome:
     scenario: str = ""
     """The scene and what happened to it, as JSON (:class:`hdril.tasks.scenario.Scenario`)."""
 
-    def noticed_in_words(self, period: float) -> str:
-        """What the policy noticed, each thing once with all its times, for a ``period`` of control in s."""
-        times: dict[str, list[str]] = {}
-        for frame, words in self.noticed:
-            times.setdefault(words, []).append(f"{period * frame:.1f} s")
-        return "; ".join(f"{words} at {', '.join(at)}" for words, at in times.items())
+
+def in_words(happened: Sequence[tuple[int, str]], period: float) -> str:
+    """What happened or was noticed, by frame, each thing once with all its times, for a ``period`` of control in s."""
+    times: dict[str, list[str]] = {}
+    for frame, words in happened:
+        times.setdefault(words, []).append(f"{period * frame:.1f} s")
+    return "; ".join(f"{words} at {', '.join(at)}" for words, at in times.items())
 
 
 def score_episode(task: Task, seed: int, trace: Trace, reference: Reference, ending: Ending) -> Outcome:

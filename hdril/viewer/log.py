@@ -10,6 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from hdril.evaluation.evaluate import EvaluatedEpisode
+from hdril.evaluation.score import in_words
 from hdril.simulation.actions import hand_poses, openings
 from hdril.simulation.robots.spec import SIDES
 from hdril.viewer.blueprint import robot_entity
@@ -181,16 +182,16 @@ class EpisodeLog:
             where = f"more than 2 cm from the expert's path, in {outcome.departed_in}"
             self._log_at(frame, "log", rr.TextLog(where, level="WARN"))
             left = f"**At {times[frame]:.1f} s first {where}.**\n\n"
-        happened = "".join(f"**{event} at {times[frame]:.1f} s.**\n\n" for frame, event in outcome.events)
-        noticed = outcome.noticed_in_words(self._env.task_spec.physics.control_period)
-        noticed = f"Noticed: {noticed}.\n\n" if noticed else ""
+        period = self._env.task_spec.physics.control_period
+        happened, noticed = in_words(outcome.events, period), in_words(outcome.noticed, period)
+        happened = (f"**{happened}.**\n\n" if happened else "") + (f"Noticed: {noticed}.\n\n" if noticed else "")
         verdict = "success" if outcome.success else f"failure: {outcome.unmet}"
         level = "INFO" if outcome.success else "ERROR"
         self._log_at(len(times) - 1, "log", rr.TextLog(verdict, level=level))
         self._stream.reset_time()
         text = (
             f"**{self._env.task}, seed {outcome.seed}: {verdict}**\n\n{left}"
-            f"{happened}{noticed}Played: {' → '.join(outcome.primitives) or 'no primitives'}\n\n"
+            f"{happened}Played: {' → '.join(outcome.primitives) or 'no primitives'}\n\n"
             f"Mean error against the expert: {outcome.position_error_cm:.2f} cm, {outcome.angle_error_rad:.3f} rad. "
             f"Inverse kinematics failed on {outcome.ik_failures} of {outcome.frames} frames."
         )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hdril.evaluation.reference import Reference
-from hdril.evaluation.score import DEPARTURE, Outcome, score_episode
+from hdril.evaluation.score import DEPARTURE, Outcome, in_words, score_episode
 from hdril.tasks import get_task
 from hdril.trace import Trace
 from tests.evaluation.synthetic import FAILED, SUCCEEDED, TASK, explanation, moved, reference, trace
@@ -46,8 +46,9 @@ def test_what_the_policy_noticed_is_told_by_frame() -> None:
     explanations = [None, *(replace(explanation(k), events=words) for k, words in enumerate(((), ("a", "b"), ("a",))))]
     outcome = score(trace((0, 0, 1, 2), explanations=explanations))
     assert outcome.noticed == ((2, "a"), (2, "b"), (3, "a"))
-    assert outcome.noticed_in_words(0.1) == "a at 0.2 s, 0.3 s; b at 0.2 s"
-    assert (score(trace()).noticed, score(trace()).noticed_in_words(0.1)) == ((), "")
+    assert in_words(outcome.noticed, 0.1) == "a at 0.2 s, 0.3 s; b at 0.2 s"
+    assert score(trace()).noticed == ()
+    assert in_words((), 0.1) == ""
 
 
 def test_failures_of_inverse_kinematics_are_counted_by_frame() -> None:

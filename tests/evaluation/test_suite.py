@@ -221,10 +221,11 @@ def test_a_report_names_each_event_and_what_the_policy_noticed_at_its_time(tmp_p
     run = Run("table_lift:push=1", "somewhere", (), 0, 2, None)
     noticed = ((14, "grasp tried again"), (20, "lift tried again"), (26, "grasp tried again"))
     pushed = outcome(1, success=False, unmet="table upright", events=((3, "push: table (0.80 N s)"),), noticed=noticed)
-    write_report(tmp_path, run, [outcome(0), pushed])
+    write_report(tmp_path, run, [outcome(0), pushed, outcome(2, noticed=((5, "move tried again"),))])
     lines = [[cell.strip() for cell in line.split("|")] for line in (tmp_path / "report.md").read_text().splitlines()]
     said = "grasp tried again at 1.4 s, 2.6 s; lift tried again at 2.0 s"
     assert ["", "1", "push: table (0.80 N s) at 0.3 s", said, "failure: table upright", ""] in lines
+    assert ["", "2", "", "move tried again at 0.5 s", "success", ""] in lines
     write_report(tmp_path, run, [outcome(0)])
     assert "## Events" not in (tmp_path / "report.md").read_text()
 

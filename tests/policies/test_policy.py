@@ -57,6 +57,20 @@ def test_variant_learns_saves_loads_and_runs(variant: str, metadata, tmp_path: P
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
+def test_attention_is_shared_among_hands_and_objects(variant: str, metadata) -> None:
+    policy = build(metadata, **VARIANTS[variant]).eval()
+    policy.select_action(observation(metadata, [0, FRAMES]))
+    attention = policy.attention()
+    for weights in (attention.planner, attention.dynamics):
+        assert weights.shape == (2, len(attention.nodes), len(attention.nodes))
+        torch.testing.assert_close(weights.sum(-1), torch.ones(2, len(attention.nodes)))
+    told = policy.explain()
+    assert told is not None
+    assert list(told.attention) == ["left", "right", "table"]
+    assert sum(told.attention.values()) == pytest.approx(1.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
 def test_batched_and_single_give_the_same_actions(variant: str, metadata) -> None:
     policy = build(metadata, **VARIANTS[variant]).eval()
     frames = [0, 70, 140]
@@ -272,7 +286,9 @@ def test_linear_maps_alone_predict_what_the_whole_does_before_its_network_learns
     assert given.std() > 0.1
 
 
-@pytest.mark.parametrize("given", [{"state_skip": False}, {"latent": "variational"}, {"experts": "stacked"}])
+@pytest.mark.parametrize(
+    "given", [{"state_skip": False}, {"per_primitive": False}, {"latent": "variational"}, {"experts": "stacked"}]
+)
 def test_linear_maps_alone_refuse_what_would_act_on_nothing(given) -> None:
     with pytest.raises(ValueError, match=r"policy\.decoder=(linear needs|gru; got linear)"):
         HDRILConfig(device="cpu", push_to_hub=False, decoder="linear", **given)

@@ -170,10 +170,10 @@ class HDRILConfig(PreTrainedConfig):
             raise ValueError("policy.kl_weight and policy.samples are for policy.latent=variational")
         if self.experts == "stacked" and self.decoder != "gru":
             raise ValueError(f"policy.experts=stacked works with policy.decoder=gru; got {self.decoder}")
-        if self.decoder == "linear" and not (self.state_skip and self.latent == "deterministic"):
+        if self.decoder == "linear" and not (self.state_skip and self.per_primitive and self.latent == "deterministic"):
             raise ValueError(
-                "policy.decoder=linear needs policy.state_skip=true and policy.latent=deterministic; "
-                f"got {self.state_skip} and {self.latent}"
+                "policy.decoder=linear needs policy.state_skip=true, policy.per_primitive=true and "
+                f"policy.latent=deterministic; got {self.state_skip}, {self.per_primitive} and {self.latent}"
             )
         if self.filter_frames > 1 and not self.state_skip:
             raise ValueError(

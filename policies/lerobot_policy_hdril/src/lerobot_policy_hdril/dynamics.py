@@ -168,7 +168,8 @@ class PrimitiveDynamics(nn.Module):
         self.state_skip = StateSkip(seen, out_dim, steps, stride) if state_skip else None
         self.has_network = decoder != "linear"
         if not self.has_network:
-            self.graph = NoInteraction(names, node_dim)
+            # Nobody attends to another; the nodes are the planner's.
+            self.graph = NoInteraction(make_interaction(interaction, names, node_dim).node_names, node_dim)
             return
         self.graph = make_interaction(interaction, names, node_dim)
         self.register_buffer("skip_columns", torch.tensor(skip_columns, dtype=torch.long), persistent=False)
