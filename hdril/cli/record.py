@@ -18,6 +18,7 @@ from tqdm import tqdm
 from hdril import __version__
 from hdril.cli.check import CheckConfig, check_command
 from hdril.cli.common import check_repo_id, run
+from hdril.demonstrations.labels import NUMBERS, WORDS, check_forms
 from hdril.demonstrations.provenance import Recipe, read_provenance
 from hdril.demonstrations.record import check_numbers, partial_folder, record, record_shard, refuse_existing
 from hdril.execution import SlurmConfig, check_execution, run_on_ray, submit_to_slurm
@@ -52,6 +53,9 @@ class RecordConfig:
     outputs/<task>/dataset."""
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Processes that simulate. The dataset is the same for any number."""
+    labels: str = NUMBERS
+    """Forms of the labels of primitives, separated by commas: subtask_index, and language for LeRobot's column
+    language_persistent, which some viewers cannot read."""
     shards: int = 1
     """Shares of the seeds that are played apart: by executor, or one by one with shard. They do not change the dataset."""
     shard: int | None = None
@@ -83,6 +87,8 @@ def record_command(config: RecordConfig) -> None:
         check_repo_id("repo_id", config.repo_id)
     elif config.push:
         raise ValueError("--push needs --repo_id: the name of the dataset on the Hub, as user/name")
+    if NUMBERS not in check_forms(config.labels):
+        raise ValueError(f"labels must have {NUMBERS}; it may have {WORDS} beside it, got {config.labels!r}")
     check_execution(config.executor, config.shards, config.slurm)
     if config.push and (config.shard is not None or config.executor == "slurm"):
         raise ValueError("--push comes when the dataset is whole: give it without --shard and --executor=slurm")
@@ -152,15 +158,17 @@ def _record_on_ray(recipe: Recipe, config: RecordConfig, root: Path) -> None:
 
 
 def _submit(recipe: Recipe, config: RecordConfig, root: Path) -> None:
-    work, finish = (
-        _shares(recipe, config, root),
-        partial(record, recipe, config.num_episodes, config.seed, root.resolve()),
-    )
+    work = _shares(recipe, config, root)
+    finish = partial(record, recipe, config.num_episodes, config.seed, root.resolve(), words=_in_words(config))
     array, last = submit_to_slurm(
         work, finish, "hdril_record", config.shards, config.workers, config.slurm, _logs(root)
     )
     print(f"Submitted {config.shards} shards as job {array}; job {last} then makes {root}")
     print(f"Logs: {_logs(root)}; after a failure, the same command plays what is missing")
+
+
+def _in_words(config: RecordConfig) -> bool:
+    return WORDS in check_forms(config.labels)
 
 
 def _logs(root: Path) -> Path:
@@ -184,7 +192,7 @@ def _record(recipe: Recipe, config: RecordConfig, root: Path) -> None:
     start = time.monotonic()
     try:
         with _progress_bar(f"recording {config.task}", config.num_episodes) as progress:
-            made = record(recipe, config.num_episodes, config.seed, root, config.workers, progress)
+            made = record(recipe, config.num_episodes, config.seed, root, config.workers, progress, _in_words(config))
     except KeyboardInterrupt:
         print(f"\nStopped; nothing was written to {root}. Run the same command again to go on.")
         raise

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from hdril.actor import Actor
 from hdril.demonstrations.episode import Episode, demonstrate
+from hdril.demonstrations.labels import add_words
 from hdril.demonstrations.provenance import Provenance, Recipe
 from hdril.demonstrations.shards import Shards
 from hdril.demonstrations.write import write_dataset
@@ -82,12 +83,13 @@ def record(
     root: Path,
     workers: int = 1,
     progress: Callable[[int, int], None] | None = None,
+    words: bool = False,
 ) -> Provenance:
     """Record ``num_episodes`` successful demonstrations as a LeRobot dataset at ``root``.
 
     Seeds are tried in order from ``first_seed``; failures are dropped and reported. Until the dataset is whole it lives
     in ``<root>.partial``; after an interruption the same call goes on from there. ``progress`` is called with the numbers
-    of kept and dropped episodes.
+    of kept and dropped episodes. With ``words``, the primitives are in ``language_persistent``, too.
 
     Raises:
         FileExistsError: there is something at ``root``.
@@ -105,7 +107,7 @@ def record(
             selection = _Selection(num_episodes, progress)
             _fill(selection, shards, lambda seed: episodes(recipe, seed, workers), first_seed)
             provenance = Provenance(recipe, tuple(episode.seed for episode in selection.kept), selection.dropped)
-            provenance = _publish(provenance, selection.kept, partial, root)
+            provenance = _publish(provenance, selection.kept, partial, root, words)
         except BaseException as error:
             if isinstance(error, ExpertError) or not any(partial.glob("*.npz")):
                 shutil.rmtree(partial)  # there is nothing to go on from
@@ -206,11 +208,13 @@ def _fill(selection: _Selection, shards: Shards, stream: Callable[[int], Generat
     raise ValueError(f"only {len(selection.kept)} demonstrations succeeded up to the largest seed; choose a lower seed")
 
 
-def _publish(provenance: Provenance, kept: list[Episode], partial: Path, root: Path) -> Provenance:
+def _publish(provenance: Provenance, kept: list[Episode], partial: Path, root: Path, words: bool) -> Provenance:
     """Write the dataset beside its place and move it there when it is whole; returns its provenance with its digest."""
     staged = partial / "dataset"
     shutil.rmtree(staged, ignore_errors=True)
     provenance = write_dataset(staged, provenance, kept)
+    if words:
+        add_words(staged)
     root.parent.mkdir(parents=True, exist_ok=True)
     staged.replace(root)
     shutil.rmtree(partial, ignore_errors=True)

@@ -22,6 +22,8 @@ SUBTASK = "subtask_index"
 """Label of a frame: the primitive that the expert executes, an index into :data:`SUBTASKS_PATH`."""
 SUBTASK_START = "subtask_start"
 """Whether a primitive starts at this frame: tells a primitive that is played twice from one that goes on."""
+LANGUAGE = "language_persistent"
+"""LeRobot's column of language: in every frame all rows of the episode, see :mod:`hdril.demonstrations.labels`."""
 REWARD, SUCCESS, DONE = "next.reward", "next.success", "next.done"
 SEED = "seed"
 """Column of ``meta/episodes``: the seed of the episode."""
@@ -40,6 +42,7 @@ __all__ = [
     "DIGEST",
     "DONE",
     "ENVIRONMENT_STATE",
+    "LANGUAGE",
     "PROPORTIONS_PATH",
     "RECIPE_PATH",
     "REWARD",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -87,11 +88,18 @@ def _write_names(root: Path, task: Task, episodes: list[Episode]) -> None:
     # Rerun's loader looks for the column that pandas makes of an index without a name, LeRobot reads it under any name.
     tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([task.description]))
     tasks.to_parquet(root / "meta/tasks.parquet")
-    subtasks = pd.DataFrame({SUBTASK: range(len(task.labels))}, index=pd.Index(task.labels, name="subtask"))
-    subtasks.to_parquet(root / SUBTASKS_PATH)
+    write_primitives(root, task.labels)
     played = np.concatenate([episode.label for episode in episodes])
     shares = {name: float((played == label).mean()) for label, name in enumerate(task.labels)}
     (root / PROPORTIONS_PATH).write_text(json.dumps(shares, indent=2))
+
+
+def write_primitives(root: Path, names: Sequence[str]) -> None:
+    """Write the names of the primitives, by label."""
+    import pandas as pd
+
+    table = pd.DataFrame({SUBTASK: range(len(names))}, index=pd.Index(names, name="subtask"))
+    table.to_parquet(root / SUBTASKS_PATH)
 
 
 def _places(count: int, index: int, start: int, fps: int) -> dict[str, np.ndarray]:

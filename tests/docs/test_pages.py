@@ -18,6 +18,7 @@ import hdril
 from hdril.cli.bench import BenchConfig
 from hdril.cli.check import CheckConfig
 from hdril.cli.eval import EvalConfig
+from hdril.cli.labels import LabelsConfig
 from hdril.cli.record import RecordConfig
 from hdril.cli.view import ViewConfig
 from hdril.demonstrations.provenance import Recipe
@@ -30,6 +31,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *(page for folder in FOLDERS for page in (RO
 COMMANDS = {
     "hdril-record": RecordConfig,
     "hdril-check": CheckConfig,
+    "hdril-labels": LabelsConfig,
     "hdril-eval": EvalConfig,
     "hdril-view": ViewConfig,
     "hdril-bench": BenchConfig,

@@ -14,7 +14,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from lerobot_policy_hdril.graph import feature_names
 from lerobot_policy_hdril.presets import PRESETS
 from lerobot_policy_hdril.provenance import TrainingData
-from lerobot_policy_hdril.schema import SUBTASK_KEY
+from lerobot_policy_hdril.schema import LANGUAGE, SUBTASK_KEY
 
 Interaction = Literal["none", "scalar", "object"]
 Decoder = Literal["gru", "ode", "linear"]
@@ -108,7 +108,8 @@ class HDRILConfig(PreTrainedConfig):
 
     # Learned from the dataset; part of the checkpoint.
     subtask_key: str = SUBTASK_KEY
-    """Column of the dataset that labels each frame with its primitive."""
+    """Column of the dataset that labels each frame with its primitive. A dataset without ``subtask_index`` may have LeRobot's
+    ``language_persistent`` instead, with rows of the style ``subtask``."""
     primitives: list[str] = field(default_factory=list)
     primitive_lengths: list[list[int]] = field(default_factory=list)
     """Shortest and longest run of each primitive in the episodes learned from, frames; [0, 0] for a primitive that is in
@@ -214,7 +215,8 @@ class HDRILConfig(PreTrainedConfig):
         Raises:
             ValueError: the dataset has no labels, or lacks a feature, or is not the one that the checkpoint learned.
         """
-        if self.subtask_key not in features:
+        in_words = self.subtask_key == SUBTASK_KEY and LANGUAGE in features
+        if self.subtask_key not in features and not in_words:
             raise ValueError(
                 f"the dataset has no column {self.subtask_key!r} that labels its frames with primitives; "
                 f"its columns: {', '.join(features)}"

@@ -21,7 +21,7 @@ import torch
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
-from lerobot_policy_hdril.schema import SUBTASK_KEY, SUBTASK_START, SUBTASKS_PATH
+from lerobot_policy_hdril.schema import LANGUAGE, LANGUAGE_STYLE, SUBTASK_KEY, SUBTASK_START, SUBTASKS_PATH
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -74,28 +74,69 @@ def read_primitives(root: Path) -> list[str]:
     return [str(name) for name in names]
 
 
-def _read_columns(root: Path, subtask_key: str) -> dict[str, np.ndarray]:
-    """The columns in the order of ``index``; ``state`` is observation.state and environment_state side by side."""
+def _read_columns(root: Path, subtask_key: str) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The columns in the order of ``index``, and the names of the primitives; ``state`` is observation.state and
+    environment_state side by side."""
     files = sorted((root / "data").glob("*/*.parquet"))
     if not files:
         raise ValueError(f"{root} holds no data/*/*.parquet")
-    keys = [OBS_STATE, OBS_ENV_STATE, ACTION, subtask_key, "index", "episode_index"]
     source = parquet.ParquetDataset(files)
-    marked = subtask_key == SUBTASK_KEY and SUBTASK_START in source.schema.names
-    table = source.read(columns=[*keys, *([SUBTASK_START] if marked else [])])
+    there = source.schema.names
+    in_words = subtask_key not in there
+    marked = subtask_key == SUBTASK_KEY and SUBTASK_START in there
+    labels = [LANGUAGE, "timestamp"] if in_words else [subtask_key, *([SUBTASK_START] if marked else [])]
+    table = source.read(columns=[OBS_STATE, OBS_ENV_STATE, ACTION, "index", "episode_index", *labels])
     table = table.take(np.argsort(table.column("index").to_numpy(), kind="stable"))
     columns = {
         "state": np.concatenate([_matrix(table, OBS_STATE), _matrix(table, OBS_ENV_STATE)], axis=1),
         "action": _matrix(table, ACTION),
-        "label": table.column(subtask_key).to_numpy().astype(np.int64),
         "index": table.column("index").to_numpy().astype(np.int64),
         "episode_index": table.column("episode_index").to_numpy().astype(np.int64),
     }
-    if marked:
-        columns["start"] = table.column(SUBTASK_START).to_numpy().astype(bool)
     if not all(np.isfinite(columns[key]).all() for key in ("state", "action")):
         raise ValueError(f"{root} holds states or actions that are not finite")
-    return columns
+    if in_words:
+        columns["label"], columns["start"], primitives = _read_words(root, table, columns["episode_index"])
+        return columns, primitives
+    columns["label"] = table.column(subtask_key).to_numpy().astype(np.int64)
+    if marked:
+        columns["start"] = table.column(SUBTASK_START).to_numpy().astype(bool)
+    return columns, read_primitives(root)
+
+
+def _read_words(root: Path, table: pyarrow.Table, episodes: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """Labels and starts (N,), and the primitives, from LeRobot's language rows; every frame of an episode holds them all.
+
+    Primitives are numbered as in :data:`SUBTASKS_PATH`, or in the order in which they first appear.
+    """
+    first = np.flatnonzero(np.diff(episodes, prepend=-1) != 0)
+    begins = [_begins(root, int(episodes[at]), table.column(LANGUAGE)[int(at)].as_py()) for at in first]
+    if (root / SUBTASKS_PATH).exists():
+        primitives = read_primitives(root)
+    else:
+        primitives = list(dict.fromkeys(name for episode in begins for _, name in episode))
+    time, label = table.column("timestamp").to_numpy(), np.zeros(len(episodes), np.int64)
+    start = np.zeros(len(episodes), bool)
+    for begin, end, episode in zip(first, [*first[1:], len(episodes)], begins, strict=True):
+        # Times are kept as float32 in some files and as float64 in others.
+        frames = np.searchsorted(time[begin:end], np.array([at for at, _ in episode]) - 1e-4)
+        where = f"{root}, episode {episodes[begin]}: its rows of the style {LANGUAGE_STYLE!r}"
+        if frames[0] > 0 or frames[-1] >= end - begin or (np.diff(frames) <= 0).any():
+            raise ValueError(f"{where} must begin with the first frame, and no two at the same")
+        if unknown := [name for _, name in episode if name not in primitives]:
+            raise ValueError(f"{where} name {unknown[0]!r}, which is not in {SUBTASKS_PATH}")
+        start[begin + frames] = True
+        counts = np.diff([*frames, end - begin])
+        label[begin:end] = np.repeat([primitives.index(name) for _, name in episode], counts)
+    return label, start, primitives
+
+
+def _begins(root: Path, episode: int, rows: list[dict] | None) -> list[tuple[float, str]]:
+    """When each primitive of an episode begins, s, and its name."""
+    mine = [row for row in rows or () if row["style"] == LANGUAGE_STYLE and row["content"]]
+    if not mine:
+        raise ValueError(f"{root}, episode {episode}: {LANGUAGE} has no row of the style {LANGUAGE_STYLE!r}")
+    return sorted((float(row["timestamp"]), str(row["content"])) for row in mine)
 
 
 def _matrix(table: pyarrow.Table, key: str) -> np.ndarray:
@@ -134,8 +175,7 @@ class Demonstrations:
 
     def __init__(self, metadata: LeRobotDatasetMetadata, subtask_key: str, device: str, filter_frames: int = 1) -> None:
         root = Path(metadata.root)
-        self.primitives = read_primitives(root)
-        columns = _read_columns(root, subtask_key)
+        columns, self.primitives = _read_columns(root, subtask_key)
         _check_labels(columns["label"], self.primitives)
         self.digest = _digest(columns, self.primitives)
         new_episode = np.diff(columns["episode_index"], prepend=-1) != 0
