@@ -25,7 +25,7 @@ FLOORS = (
 """Packages from the top down: none imports one above it or beside it."""
 PARTS = {"trace": "rollout"}
 """Modules that are drawn as part of another."""
-LEFT_OUT = ("actor", "digest", "errors", "files", "geometry", "markdown", "plugins", "workers", "__init__")
+LEFT_OUT = ("actor", "digest", "errors", "execution", "files", "geometry", "markdown", "plugins", "workers", "__init__")
 """Small modules that any package may use; they import no package."""
 POLICY = "lerobot_policy_hdril"
 MEETINGS = {"evaluation": "LeRobot, explain()", "demonstrations": "the dataset's schema"}
