@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from hdril.demonstrations.episode import demonstrate
 from hdril.demonstrations.provenance import Provenance, Recipe, read_provenance
 from hdril.demonstrations.record import partial_folder, record, record_shard
+from hdril.demonstrations.shards import Shards
 from hdril.errors import UserError
 from hdril.execution import SlurmConfig, check_execution, run_on_ray, share
 
@@ -74,11 +76,19 @@ def test_shards_in_any_order_and_number_make_the_same_dataset(alone: Provenance,
     assert not partial_folder(root).exists()
 
 
-def test_what_shards_left_is_played(alone: Provenance, tmp_path: Path) -> None:
+def test_what_shards_left_is_played_and_nothing_else(alone: Provenance, tmp_path: Path, monkeypatch) -> None:
     root = tmp_path / "set"
     record_shard(RECIPE, COUNT, 50, root, 1, 2)
     (partial_folder(root) / "53.npz").write_bytes(b"half")
+    played: list[int] = []
+
+    def note(env, expert, seed: int):
+        played.append(seed)
+        return demonstrate(env, expert, seed)
+
+    monkeypatch.setattr("hdril.demonstrations.record.demonstrate", note)
     assert record(RECIPE, COUNT, 50, root) == alone
+    assert played == [50, 51, 53]
 
 
 def test_a_shard_refuses_what_the_whole_refuses(alone: Provenance, tmp_path: Path) -> None:
@@ -92,6 +102,16 @@ def test_a_shard_refuses_what_the_whole_refuses(alone: Provenance, tmp_path: Pat
     with pytest.raises(FileExistsError, match="choose another root or delete it"):
         record_shard(RECIPE, COUNT, 50, root, 0, 1)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["set", "set.partial"]
+
+
+def test_a_shard_that_is_late_says_so(made_up, tmp_path: Path) -> None:
+    """The recording was finished meanwhile; nothing is left behind that a later one could take for its own."""
+    shards = Shards(tmp_path / "set.partial", RECIPE, 50)
+    shards.put(made_up(50))
+    shutil.rmtree(tmp_path / "set.partial")
+    with pytest.raises(UserError, match="was removed by another process, which finished the recording or gave it up"):
+        shards.put(made_up(51))
+    assert not list(tmp_path.iterdir())
 
 
 # --------------------------------------------------------------------- real clusters

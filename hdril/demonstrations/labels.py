@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -93,6 +94,11 @@ def add_words(root: Path) -> None:
 
     def add(episode: pa.Table) -> pa.Table:
         label, time = episode[SUBTASK].to_numpy(), episode["timestamp"].to_numpy()
+        if label.min() < 0 or label.max() >= len(primitives):
+            where = f"{root}, episode {episode['episode_index'][0]}"
+            raise ValueError(
+                f"{where}: labels go from {label.min()} to {label.max()}, and {len(primitives)} have names"
+            )
         starts = np.diff(label, prepend=-1) != 0
         if SUBTASK_START in episode.column_names:
             starts |= episode[SUBTASK_START].to_numpy()
@@ -148,15 +154,15 @@ def convert(root: Path, form: str, output: Path) -> None:
         raise ValueError(f"{root} has no column {columns[other]} to take the labels from")
     if output.exists():
         raise FileExistsError(f"{output} exists; choose another output or delete it")
-    partial = output.with_name(output.name + ".partial")
-    shutil.rmtree(partial, ignore_errors=True)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    made = Path(tempfile.mkdtemp(dir=output.parent, prefix=f".{output.name}."))
+    partial = made / "copy"
     try:
         shutil.copytree(root, partial)
         {NUMBERS: add_numbers, WORDS: add_words}[form](partial)
         partial.replace(output)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
 
 
 def _files(root: Path) -> list[Path]:

@@ -192,19 +192,25 @@ class _Selection:
 
 
 def _fill(selection: _Selection, shards: Shards, stream: Callable[[int], Generator[Episode]], first_seed: int) -> None:
-    """Add the episodes of an earlier, interrupted recording, and then new ones."""
-    seed = first_seed
-    for episode in shards.take():
-        selection.add(episode)
-        if selection.complete:
-            return
-        seed = episode.seed + 1
-    with closing(stream(seed)) as fresh:
-        for episode in fresh:
-            shards.put(episode)
+    """Add episodes in the order of seeds: those that are there, and new ones where one is missing."""
+    seed, more = first_seed, True
+    while more:
+        for episode in shards.take(seed):
             selection.add(episode)
             if selection.complete:
                 return
+            seed = episode.seed + 1
+        more = False
+        with closing(stream(seed)) as fresh:
+            for episode in fresh:
+                shards.put(episode)
+                selection.add(episode)
+                if selection.complete:
+                    return
+                seed = episode.seed + 1
+                if shards.path(seed).exists():  # of another shard
+                    more = True
+                    break
     raise ValueError(f"only {len(selection.kept)} demonstrations succeeded up to the largest seed; choose a lower seed")
 
 

@@ -15,7 +15,10 @@ import numpy as np
 from hdril import __version__
 from hdril.demonstrations.episode import Episode
 from hdril.demonstrations.provenance import Recipe
+from hdril.errors import UserError
 from hdril.files import write_atomically
+
+_PLAN = "plan.json"
 
 
 class Shards:
@@ -28,7 +31,7 @@ class Shards:
     def __init__(self, folder: Path, recipe: Recipe, first_seed: int) -> None:
         self._folder, self._first_seed = folder, first_seed
         plan = json.dumps(recipe.as_dict(__version__) | {"first_seed": first_seed}, indent=2)
-        plan_file = folder / "plan.json"
+        plan_file = folder / _PLAN
         if plan_file.exists() and plan_file.read_text() != plan:
             raise ValueError(f"{folder} holds episodes of another recipe; delete it or choose another root")
         write_atomically(plan_file, lambda file: file.write(plan.encode()))
@@ -38,13 +41,24 @@ class Shards:
         return self._folder / f"{seed}.npz"
 
     def put(self, episode: Episode) -> None:
-        """Keep an episode, whether it succeeded or not."""
+        """Keep an episode, whether it succeeded or not.
+
+        Raises:
+            UserError: the folder was removed: another process finished the recording, or gave it up.
+        """
+        if not (self._folder / _PLAN).exists():
+            raise UserError(
+                f"{self._folder} was removed by another process, which finished the recording or gave it up"
+            )
         arrays = {name: np.asarray(value) for name, value in vars(episode).items()}
         write_atomically(self.path(episode.seed), lambda file: np.savez(file, allow_pickle=False, **arrays))
 
-    def take(self) -> Iterator[Episode]:
-        """Episodes from the first seed on, up to the first that is not there or cannot be read; that one is to be made again."""
-        for seed in count(self._first_seed):
+    def take(self, first_seed: int | None = None) -> Iterator[Episode]:
+        """Episodes from a seed on, the first of all unless given, up to the first that is not there or cannot be read.
+
+        That one is to be made again.
+        """
+        for seed in count(self._first_seed if first_seed is None else first_seed):
             if not self.path(seed).exists():
                 return
             try:

@@ -101,6 +101,21 @@ def rewrite(root: Path, rows: list[dict]) -> None:
     pq.write_table(table.append_column("language_persistent", pa.array([rows] * len(table))), file)
 
 
+def test_a_conversion_leaves_what_is_not_its_own(numbered: Path, tmp_path: Path) -> None:
+    """A recording to the same place may be unfinished."""
+    (tmp_path / "words.partial").mkdir()
+    (tmp_path / "words.partial/7.npz").write_bytes(b"an episode")
+    convert(numbered, "language", tmp_path / "words")
+    assert (tmp_path / "words.partial/7.npz").read_bytes() == b"an episode"
+
+
+def test_a_label_without_a_name_is_told(numbered: Path, tmp_path: Path) -> None:
+    pd.DataFrame({"subtask_index": range(2)}, index=["grasp", "move"]).to_parquet(numbered / SUBTASKS_PATH)
+    with pytest.raises(ValueError, match="episode 0: labels go from 0 to 5, and 2 have names"):
+        convert(numbered, "language", tmp_path / "words")
+    assert [path.name for path in tmp_path.iterdir()] == ["numbered"]
+
+
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
