@@ -54,7 +54,7 @@ class RecordConfig:
     workers: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Processes that simulate. The dataset is the same for any number."""
     labels: str = NUMBERS
-    """Forms of the labels of primitives, separated by commas: subtask_index, and language for LeRobot's column
+    """Forms of the primitives' labels, separated by commas. subtask_index must be there. language adds LeRobot's column
     language_persistent, which some viewers cannot read."""
     shards: int = 1
     """Shares of the seeds that are played apart: by executor, or one by one with shard. They do not change the dataset."""
