@@ -114,7 +114,8 @@ def check_dataset(
         )
     if rows and provenance.digest and provenance.digest != dataset_digest(digests):
         yield Finding(f"the digest of all episodes is not the one in {RECIPE_PATH}")
-    yield from compare_with_remade(stored, provenance, workers, progress)
+    if stored:  # no simulator is started for nothing
+        yield from compare_with_remade(stored, provenance, workers, progress)
 
 
 def _describe(root: Path, info: Mapping[str, Any]) -> Generator[Finding, None, Dataset | None]:

@@ -29,7 +29,7 @@ FORMS = (NUMBERS, WORDS)
 """Names of the forms."""
 _ROWS = pa.list_(
     pa.struct(
-        {"role": pa.string(), "content": pa.string(), "style": pa.string(), "timestamp": pa.float64(),
+        {"role": pa.string(), "content": pa.string(), "style": pa.string(), "timestamp": pa.float32(),
          "camera": pa.string(), "tool_calls": pa.list_(pa.string())}
     )
 )  # fmt: skip
@@ -145,12 +145,14 @@ def convert(root: Path, form: str, output: Path) -> None:
         FileNotFoundError: there is no dataset at ``root``.
         ValueError: the dataset has this form already, or not the other; or its labels cannot be converted.
     """
-    features = read_info(root)["features"]
+    read_info(root)
+    # Not info.json: LeRobot's annotation tool drops the column and leaves its declaration.
+    there = {name for file in _files(root) for name in pq.read_schema(file).names}
     columns = {NUMBERS: SUBTASK, WORDS: LANGUAGE}
     (other,) = set(FORMS) - {form}
-    if columns[form] in features:
+    if columns[form] in there:
         raise ValueError(f"{root} has a column {columns[form]} already")
-    if columns[other] not in features:
+    if columns[other] not in there:
         raise ValueError(f"{root} has no column {columns[other]} to take the labels from")
     if output.exists():
         raise FileExistsError(f"{output} exists; choose another output or delete it")

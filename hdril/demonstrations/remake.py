@@ -30,7 +30,7 @@ def compare_with_remade(
     progress: Callable[[str, int, int], None] | None,
 ) -> Iterator[Finding]:
     """What differs where episodes are made again: number for number, with no tolerance."""
-    if provenance.hdril_version != __version__ and stored:
+    if provenance.hdril_version != __version__:
         yield Finding(f"hdril {provenance.hdril_version} recorded it, and {__version__} makes it again: it may differ")
     with closing(play(provenance.recipe, [provenance.seeds[old.index] for old in stored], workers)) as again:
         for done, (old, new) in enumerate(zip(stored, again, strict=True), 1):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -38,14 +37,10 @@ def read(root: Path) -> pd.DataFrame:
 
 
 def annotate(root: Path, output: Path) -> Path:
-    """What LeRobot's annotation tool leaves: labels in words and no others, and no names of numbers."""
+    """What LeRobot's annotation tool leaves: labels in words alone, declared as before; here without the names of numbers."""
     convert(root, "language", output)
     (file,) = (output / "data").rglob("*.parquet")
     pq.write_table(pq.read_table(file).drop_columns(["subtask_index", "subtask_start"]), file)
-    info = json.loads((output / "meta/info.json").read_text())
-    for name in ("subtask_index", "subtask_start"):
-        del info["features"][name]
-    (output / "meta/info.json").write_text(json.dumps(info))
     (output / SUBTASKS_PATH).unlink()
     return output
 
@@ -143,10 +138,8 @@ def test_what_is_there_or_missing_is_told(numbered: Path, tmp_path: Path) -> Non
         convert(words, "language", tmp_path / "new")
     with pytest.raises(FileExistsError, match="choose another output"):
         convert(words, "subtask_index", numbered)
-    rewrite(words, [])
-    info = json.loads((words / "meta/info.json").read_text())
-    del info["features"]["language_persistent"]
-    (words / "meta/info.json").write_text(json.dumps(info))
+    (file,) = (words / "data").rglob("*.parquet")
+    pq.write_table(pq.read_table(file).drop_columns("language_persistent"), file)
     with pytest.raises(ValueError, match="has no column language_persistent to take the labels from"):
         convert(words, "subtask_index", tmp_path / "new")
 
