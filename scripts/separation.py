@@ -2,9 +2,10 @@
 
 python scripts/separation.py                       trains and evaluates what is missing, then writes docs/separation.md and .json
 python scripts/separation.py --tasks table_lift    one task
+python scripts/separation.py --models linear gru_gru    some models
 
 For each task: demonstrations at the level ``varied``, one training of each model on them, and the same held-out seeds for all.
-``linear`` has linear maps alone, once a primitive or at every frame. After Ctrl-C the same command continues.
+``linear`` has linear maps alone, once a primitive or at every frame; ``hdril_reactive`` looks at every frame too. After Ctrl-C the same command continues.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ MODELS: dict[str, tuple[str, ...]] = {
     "gru_gru": ("--policy.preset=gru_gru",),
     "hdril_paper": ("--policy.preset=hdril_paper",),
     "hdril": ("--policy.preset=hdril",),
-    "hdril_every_frame": ("--policy.preset=hdril", "--policy.replan_every=1"),
+    "hdril_reactive": ("--policy.preset=hdril_reactive",),
 }
 """Models by the name of their row, weakest first as one would expect."""
 
@@ -40,6 +41,7 @@ def training(task: str, options: argparse.Namespace) -> list[list[Stage]]:
         [train_stage(f"{task}, {name}", "train/table_lift", root / "dataset", root / name / "train", options.steps,
                      f"--batch_size={options.batch_size}", *model)]
         for name, model in MODELS.items()
+        if name in options.models
     ]  # fmt: skip
 
 
@@ -61,9 +63,9 @@ def markdown(results: dict[str, Any]) -> str:
         "against `hdril`, adjusted by Holm's method.",
     ]
     for task, entry in results["tasks"].items():
-        rows, base = entry["rows"], entry["rows"]["hdril"]
-        others = [name for name in rows if name != "hdril"]
-        tests = [paired_p_value(rows[name], base) for name in others]
+        rows = entry["rows"]
+        others = [name for name in rows if name != "hdril" and "hdril" in rows]
+        tests = [paired_p_value(rows[name], rows["hdril"]) for name in others]
         texts = {
             name: p.text(value) for name, p, value in zip(others, tests, holm([p.value for p in tests]), strict=True)
         }
@@ -83,6 +85,7 @@ def markdown(results: dict[str, Any]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), choices=list(TASKS), metavar="TASK")
+    parser.add_argument("--models", nargs="+", default=list(MODELS), choices=list(MODELS), metavar="MODEL")
     parser.add_argument("--demonstrations", type=int, default=500)
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--batch-size", type=int, default=128)
@@ -102,10 +105,12 @@ def main() -> None:
         dataset = options.output / task / "dataset"
         run_chains([[record_stage(f"{task}:level=varied", "hdril/separation", dataset, options.demonstrations)]])
         run_chains(training(task, options), options.jobs)
-        stages = {name: evaluation(task, name, options) for name in MODELS}
+        stages = {name: evaluation(task, name, options) for name in options.models}
         run_chains([[stage] for stage in stages.values()], options.jobs)
         rows = {name: summarise(json.loads(stage.result.read_text())) for name, stage in stages.items()}
-        results["tasks"][task] = {"commit": commit(), "rows": rows}
+        known = results["tasks"].get(task, {"rows": {}})["rows"] | rows
+        ordered = {name: known[name] for name in MODELS if name in known}
+        results["tasks"][task] = {"commit": commit(), "rows": ordered}
         write_atomically(data, lambda file: file.write(json.dumps(results, indent=1).encode()))
         options.document.with_suffix(".md").write_text(markdown(results))
 
