@@ -5,7 +5,8 @@ python scripts/separation.py --tasks table_lift    one task
 python scripts/separation.py --models linear gru_gru    some models
 
 For each task: demonstrations at the level ``varied``, one training of each model on them, and the same held-out seeds for all.
-``linear`` has linear maps alone, once a primitive or at every frame; ``hdril_reactive`` looks at every frame too. After Ctrl-C the same command continues.
+``linear`` has linear maps alone, once a primitive or at every frame; ``hdril_reactive`` looks at every frame too.
+After Ctrl-C the same command continues.
 """
 
 from __future__ import annotations
