@@ -56,6 +56,9 @@ def transitions(
     An actor that raises StopIteration knows nothing more to do: the episode ends there, as a failure.
 
     ``scenario`` is played instead of the one that the environment samples from the seed, such as its control without events.
+
+    Raises:
+        RuntimeError: the actor knows nothing to do at the first frame.
     """
     observation, info = env.reset(seed=seed, options=None if scenario is None else {"scenario": scenario})
     actor.reset(seed)
@@ -66,6 +69,8 @@ def transitions(
         try:
             decision = actor.act(env.exact_observation() if isinstance(actor, Privileged) else observation)
         except StopIteration:
+            if env.frame == 0:
+                raise RuntimeError(f"{env.task}: the actor gave up before the first frame of seed {seed}") from None
             return
         # float32 is what a dataset stores: an episode can be played again from its recorded actions.
         action = np.asarray(decision.action, np.float32)

@@ -17,6 +17,8 @@ EXPLANATION = Explanation(1, np.array([0.0, 1.0], np.float32))
 class Countdown:
     """An environment whose observation is the frame. It ends after ``length`` frames, with success or cut."""
 
+    task = "countdown"
+
     def __init__(self, length: int, success: bool) -> None:
         self.length, self.success, self.frame = length, success, -1
         self.actions: list[np.ndarray] = []
@@ -137,3 +139,12 @@ def test_an_actor_that_gives_up_ends_the_episode_as_a_failure() -> None:
     ending = run_episode(cast(BimanualEnv, Countdown(5, success=True)), GivesUp(), 0, log)
     assert ending == Ending(False, "table upright, table at rest", 3)
     assert len(log.seen) == 3
+
+
+def test_an_actor_that_gives_up_at_once_is_named_with_its_seed() -> None:
+    class KnowsNothing(Counter):
+        def act(self, observation: Observation) -> Decision:
+            raise StopIteration
+
+    with pytest.raises(RuntimeError, match=r"countdown: the actor gave up before the first frame of seed 7"):
+        run_episode(cast(BimanualEnv, Countdown(5, success=True)), KnowsNothing(), 7)
