@@ -12,7 +12,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -46,8 +46,8 @@ class SlurmConfig:
     """Account that is charged; the user's own unless given."""
 
 
-def share(items: range, shard: int, shards: int) -> range:
-    """The ``shard``-th of ``shards`` shares of a range: neighbours stay together, and sizes differ by one at most.
+def share[Item](items: Sequence[Item], shard: int, shards: int) -> Sequence[Item]:
+    """The ``shard``-th of ``shards`` shares of a sequence: neighbours stay together, and sizes differ by one at most.
 
     Raises:
         ValueError: there is no such shard.

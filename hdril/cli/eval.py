@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Executor
-from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from hdril.cli.common import check_repo_id, run
+from hdril.cli.play import play_elsewhere, play_seeds
+from hdril.cli.shards import PlayOptions, check_shards
 from hdril.evaluation.checkpoint import resolve_config
-from hdril.evaluation.evaluate import Job, evaluate, make_job
+from hdril.evaluation.evaluate import Job, make_job
 from hdril.evaluation.held_out import HeldOut, check_held_out
 from hdril.evaluation.journal import Journal
 from hdril.evaluation.lerobot_actor import foreign_primitives
@@ -26,10 +25,10 @@ from hdril.evaluation.results import Comparison, Run, compare, headline
 from hdril.evaluation.score import Outcome
 from hdril.evaluation.stored import StoredEvaluation, read_evaluation
 from hdril.evaluation.suite import check_suite
+from hdril.execution import SlurmConfig
 from hdril.files import MAX_SEED
 from hdril.tasks import get_task
 from hdril.viewer.keep import check_keep
-from hdril.viewer.recordings import RecordingWriter
 
 
 @dataclass
@@ -43,8 +42,8 @@ class PolicySource:
     """Device of the policy in every worker."""
 
 
-@dataclass
-class EvalConfig:
+@dataclass(kw_only=True)
+class EvalConfig(PlayOptions):
     """Evaluate a LeRobot policy on held-out seeds: success with its 95 % interval, errors against the expert's
     demonstration of the same seed, a report, and Rerun recordings.
 
@@ -52,10 +51,7 @@ class EvalConfig:
     publish, the weights, the config, the task, the seeds and the software must be those that made the results.
     """
 
-    policy: PolicySource
-    task: str = "table_lift"
-    """Name of the task, with its parameters if it has any (peg_in_hole:clearance=0.004); an unknown one is answered with
-    those there are."""
+    policy: PolicySource = field(kw_only=False)
     num_episodes: int = 100
     """Episodes, one a seed."""
     seed: int = 100_000
@@ -79,8 +75,6 @@ class EvalConfig:
     """Cells of the suite, separated by commas; all unless given. The nominal one and the controls come with them."""
     output_dir: Path | None = None
     """Folder of the results; must not exist. Default: outputs/eval/<task>_<time>."""
-    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
-    """Processes. The outcomes are the same for any number."""
     push: str = ""
     """Publish results, and the checkpoint if it is a folder, in this model repository (user/name) of the Hugging Face Hub, and
     write them into its card. If output_dir holds this very evaluation already, it is published without playing anew."""
@@ -100,6 +94,7 @@ def _check(config: EvalConfig) -> None:
         raise ValueError("cells are those of a suite: add --suite=factors")
     if config.push:
         check_repo_id("push", config.push)
+    check_shards(config, bool(config.push))
     for name, least in (("num_episodes", 1), ("seed", 0), ("workers", 1)):
         if getattr(config, name) < least:
             raise ValueError(f"{name} must be at least {least}, got {getattr(config, name)}")
@@ -122,15 +117,21 @@ def eval_command(config: EvalConfig, overrides: tuple[str, ...] = ()) -> None:
     if not held_out.known:
         print(f"Note: whether these seeds are held out is not known: {held_out.basis}.")
     policy, task = resolve_config(job.checkpoint, overrides, config.policy.device), get_task(config.task)
+    # A cluster's last job does what this command does on one machine. It has one processor.
+    alone = replace(config, executor="local", slurm=SlurmConfig(), workers=1, output_dir=output.resolve())
+    finish = partial(eval_command, alone, overrides)
     if config.suite:
         from hdril.cli.suite import evaluate_suite  # it evaluates each cell by what is defined here
 
-        evaluate_suite(config, job, observes_details(policy, job.checkpoint.name, task), held_out, output)
+        detailed = observes_details(policy, job.checkpoint.name, task)
+        evaluate_suite(config, job, detailed, held_out, output, finish)
         return
     check_observation(policy, job.checkpoint.name, task)
     if output.exists():
         check_finished(read_evaluation(output), config, job)
     else:
+        if play_elsewhere(config, config.rerun, {output: job}, output, finish):
+            return
         start = time.monotonic()
         summary = evaluate_into(output, config, job, held_out)
         _announce(summary, output, time.monotonic() - start)
@@ -172,7 +173,7 @@ def evaluate_into(
     against = _read_other(config.against, job)
     journal = Journal(output, job.identity)
     with journal.writing() as add:
-        _play(config, job, journal, add, pool)
+        play_seeds(job, job.seeds, journal, add, config.rerun, config.workers, pool)
         outcomes = sorted(journal.done.values(), key=lambda outcome: outcome.seed)
         summary = write_report(journal.folder, describe(job, held_out), outcomes, _compare(outcomes, against))
         journal.finish()
@@ -198,29 +199,6 @@ def _read_other(folder: Path | None, job: Job) -> StoredEvaluation | None:
 
 def _compare(outcomes: list[Outcome], against: StoredEvaluation | None) -> Comparison | None:
     return None if against is None else compare(against.results["policy"], outcomes, against.results)
-
-
-def _play(
-    config: EvalConfig,
-    job: Job,
-    journal: Journal,
-    add: Callable[[Outcome], None],
-    pool: Executor | None,
-) -> None:
-    """Play the seeds that are left, adding to the journal as they come."""
-    left = [seed for seed in job.seeds if seed not in journal.done]
-    if not left:
-        return
-    writer = RecordingWriter(journal.folder / "rerun", config.rerun, config.seed) if config.rerun != "none" else None
-    with (
-        tqdm(total=len(job.seeds), initial=len(journal.done), desc=f"evaluating {job.task}", unit="episode") as bar,
-        closing(evaluate(job, left, min(config.workers, len(left)), writer, pool)) as stream,
-    ):
-        for outcome in stream:
-            add(outcome)
-            successes = sum(entry.success for entry in journal.done.values())
-            bar.set_postfix(success=f"{100 * successes / len(journal.done):.1f}%", refresh=False)
-            bar.update()
 
 
 def _push(config: EvalConfig, job: Job, output: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -18,16 +17,17 @@ from tqdm import tqdm
 from hdril import __version__
 from hdril.cli.check import CheckConfig, check_command
 from hdril.cli.common import check_repo_id, run
+from hdril.cli.shards import PlayOptions, check_shards, log_folder
 from hdril.demonstrations.labels import NUMBERS, WORDS, check_forms
 from hdril.demonstrations.provenance import Recipe, read_provenance
 from hdril.demonstrations.record import check_numbers, partial_folder, record, record_shard, refuse_existing
-from hdril.execution import SlurmConfig, check_execution, run_on_ray, submit_to_slurm
+from hdril.execution import run_on_ray, submit_to_slurm
 from hdril.tasks import ANY_EVENT, TASKS, base_name
 from hdril.tasks.primitives import Noise
 
 
-@dataclass
-class RecordConfig:
+@dataclass(kw_only=True)
+class RecordConfig(PlayOptions):
     """Record demonstrations of the scripted expert as a LeRobot dataset. Failures are dropped and counted.
 
     After Ctrl-C, the same command goes on where it was.
@@ -36,9 +36,6 @@ class RecordConfig:
     repo_id: str | None = None
     """Name of the dataset on the Hugging Face Hub, as user/name. Only --push needs it: a dataset that stays here has no name,
     and --dataset.repo_id of LeRobot's commands may be any beside --dataset.root."""
-    task: str = "table_lift"
-    """Name of the task, with its parameters if it has any (peg_in_hole:clearance=0.004, table_lift:level=varied); an unknown one
-    is answered with those there are."""
     events: str = ""
     """What happens to the demonstrations: names of the task's events with their probability in an episode
     (push=0.3,open_hand=0.2), any_event=0.5 for one of all. The expert mends what it can, and what it cannot is dropped."""
@@ -51,21 +48,9 @@ class RecordConfig:
     root: Path | None = None
     """Folder of the dataset; must not exist. Default: LeRobot's home under repo_id if that is given, else
     outputs/<task>/dataset."""
-    workers: int = field(default_factory=lambda: os.cpu_count() or 1)
-    """Processes that simulate. The dataset is the same for any number."""
     labels: str = NUMBERS
     """Forms of the primitives' labels, separated by commas. subtask_index must be there. language adds LeRobot's column
     language_persistent, which some viewers cannot read."""
-    shards: int = 1
-    """Shares of the seeds that are played apart: by executor, or one by one with shard. They do not change the dataset."""
-    shard: int | None = None
-    """Play this share of the seeds alone, from 0 to shards - 1, and end. The same command without it plays what is missing and
-    makes the dataset: for clusters that hdril does not know. The disk must be shared."""
-    executor: str = "local"
-    """Who plays the shards: local, this machine; slurm, jobs of a Slurm cluster, and this command ends when they are
-    submitted; ray, a Ray cluster. On a cluster, workers is how many shards play at once."""
-    slurm: SlurmConfig = field(default_factory=SlurmConfig)
-    """What the jobs of --executor=slurm may take."""
     noise: Noise = field(default_factory=Noise)
     """Noise of the demonstrations."""
     verify: Path | None = None
@@ -89,11 +74,7 @@ def record_command(config: RecordConfig) -> None:
         raise ValueError("--push needs --repo_id: the name of the dataset on the Hub, as user/name")
     if NUMBERS not in check_forms(config.labels):
         raise ValueError(f"labels must have {NUMBERS}; it may have {WORDS} beside it, got {config.labels!r}")
-    check_execution(config.executor, config.shards, config.slurm)
-    if config.push and (config.shard is not None or config.executor == "slurm"):
-        raise ValueError("--push comes when the dataset is whole: give it without --shard and --executor=slurm")
-    if config.shard is not None and config.executor != "local":
-        raise ValueError(f"--shard plays here: leave out --executor={config.executor}")
+    check_shards(config, config.push)
     recipe = Recipe(with_events(config.task, config.events), config.noise, perturb=config.perturb)
     root = config.root or default_root(recipe.task, config.repo_id)
     if config.push and root.exists():
@@ -154,26 +135,21 @@ def _shares(recipe: Recipe, config: RecordConfig, root: Path) -> Callable[[int, 
 
 
 def _record_on_ray(recipe: Recipe, config: RecordConfig, root: Path) -> None:
-    run_on_ray(_shares(recipe, config, root), config.shards, config.workers, _logs(root))
+    run_on_ray(_shares(recipe, config, root), config.shards, config.workers, log_folder(root))
 
 
 def _submit(recipe: Recipe, config: RecordConfig, root: Path) -> None:
     work = _shares(recipe, config, root)
     finish = partial(record, recipe, config.num_episodes, config.seed, root.resolve(), words=_in_words(config))
     array, last = submit_to_slurm(
-        work, finish, "hdril_record", config.shards, config.workers, config.slurm, _logs(root)
+        work, finish, "hdril_record", config.shards, config.workers, config.slurm, log_folder(root)
     )
     print(f"Submitted {config.shards} shards as job {array}; job {last} then makes {root}")
-    print(f"Logs: {_logs(root)}; after a failure, the same command plays what is missing")
+    print(f"Logs: {log_folder(root)}; after a failure, the same command plays what is missing")
 
 
 def _in_words(config: RecordConfig) -> bool:
     return WORDS in check_forms(config.labels)
-
-
-def _logs(root: Path) -> Path:
-    """Beside the dataset: what is in the partial one is removed when the dataset is whole."""
-    return root.with_name(root.name + ".jobs")
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import asdict, replace
@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hdril.cli.eval import EvalConfig, check_finished, evaluate_into
+from hdril.cli.play import play_elsewhere
 from hdril.evaluation.evaluate import Job
 from hdril.evaluation.held_out import HeldOut
 from hdril.evaluation.identity import Identity, identify_trials
@@ -23,7 +24,14 @@ from hdril.evaluation.unfinished import UnfinishedFolder
 from hdril.workers import worker_pool
 
 
-def evaluate_suite(config: EvalConfig, nominal: Job, detailed: bool, held_out: HeldOut, output: Path) -> None:
+def evaluate_suite(
+    config: EvalConfig,
+    nominal: Job,
+    detailed: bool,
+    held_out: HeldOut,
+    output: Path,
+    finish: Callable[[], object],
+) -> None:
     """Evaluate all cells, one after the other, and write the table.
 
     Args:
@@ -32,16 +40,21 @@ def evaluate_suite(config: EvalConfig, nominal: Job, detailed: bool, held_out: H
         detailed: whether the policy is shown all that may vary.
         held_out: what is known of the seeds, which all cells share.
         output: the folder of the suite.
+        finish: what ends the suite when its shards are played by jobs that outlive this process.
     """
     names = [name for name in config.cells.split(",") if name]
     cells = choose(SUITES[config.suite](config.task, detailed), names)
-    jobs = {cell.name: _job(nominal, cell) for cell in cells}
-    unfinished = UnfinishedFolder(output, "suite", "suite_run.json", _identity(config, jobs))
+    unfinished = UnfinishedFolder(output, "suite", "suite_run.json", _identity(config, nominal, cells))
+    jobs = {unfinished.folder / cell.name: _job(nominal, cell) for cell in cells}
+    if config.in_shards:
+        unfinished.begin_share()
+    if play_elsewhere(config, config.rerun, jobs, output, finish):
+        return
     start = time.monotonic()
     with unfinished.writing(), _pool(min(config.workers, config.num_episodes)) as pool:
         results = {}
-        for number, cell in enumerate(cells, 1):
-            results[cell.name] = _evaluate_cell(unfinished.folder / cell.name, config, jobs[cell.name], held_out, pool)
+        for number, (cell, (folder, job)) in enumerate(zip(cells, jobs.items(), strict=True), 1):
+            results[cell.name] = _evaluate_cell(folder, config, job, held_out, pool)
             print(f"[{number}/{len(cells)}] {cell.name}: {headline(results[cell.name])}", flush=True)
         write_suite(unfinished.folder, tabulate_suite(config.suite, config.task, cells, results))
         unfinished.finish()
@@ -55,11 +68,11 @@ def _job(nominal: Job, cell: Cell) -> Job:
     return replace(nominal, task=cell.task, identity=Identity(nominal.identity.policy, trials))
 
 
-def _identity(config: EvalConfig, jobs: dict[str, Job]) -> dict[str, Any]:
+def _identity(config: EvalConfig, nominal: Job, cells: Sequence[Cell]) -> dict[str, Any]:
     """What the suite is of; the trials of its cells are guarded by the cells."""
-    policy = next(iter(jobs.values())).identity.policy
     trials = {"task": config.task, "first_seed": config.seed, "num_episodes": config.num_episodes}
-    return {"policy": asdict(policy), "trials": trials, "suite": config.suite, "cells": ", ".join(jobs)}
+    names = ", ".join(cell.name for cell in cells)
+    return {"policy": asdict(nominal.identity.policy), "trials": trials, "suite": config.suite, "cells": names}
 
 
 @contextmanager

@@ -9,18 +9,21 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from hdril.errors import UserError
 from hdril.evaluation.identity import Identity
 from hdril.evaluation.score import Outcome
 from hdril.evaluation.unfinished import UnfinishedFolder
+from hdril.files import exclusively, write_atomically
 
-_OUTCOMES = "outcomes.jsonl"
+_OUTCOMES, _SHARDS = "outcomes.jsonl", "shards"
 
 
 class Journal:
     """An unfinished evaluation, in an :class:`~hdril.evaluation.unfinished.UnfinishedFolder`.
 
-    ``run.json`` holds what is evaluated, ``outcomes.jsonl`` a line for each episode that was played. Nothing is written before
-    :meth:`writing`.
+    ``run.json`` holds what is evaluated, ``outcomes.jsonl`` a line for each episode that was played, and
+    ``shards/*/outcomes.jsonl`` those of processes that play shares of the seeds. Nothing is written before :meth:`writing` or
+    :meth:`sharing`.
 
     Raises:
         ValueError: the folder holds an unfinished evaluation of something else; names what differs.
@@ -34,7 +37,8 @@ class Journal:
         """Outcomes by seed: those of before, and those that were added."""
 
     def _read(self) -> dict[int, Outcome]:
-        return {outcome.seed: outcome for outcome in _read_outcomes(self.folder / _OUTCOMES)}
+        files = [self.folder / _OUTCOMES, *sorted((self.folder / _SHARDS).glob(f"*/{_OUTCOMES}"))]
+        return {outcome.seed: outcome for path in files for outcome in _read_outcomes(path)}
 
     @contextmanager
     def writing(self) -> Iterator[Callable[[Outcome], None]]:
@@ -49,14 +53,39 @@ class Journal:
         # Files count, too: what another process played since must stay if it cannot be read.
         with self._unfinished.writing(begun=lambda: bool(self.done or self._read())):
             self.done = self._read()
-            with (self.folder / _OUTCOMES).open("a") as file:
-
-                def add(outcome: Outcome) -> None:
-                    file.write(json.dumps(asdict(outcome)) + "\n")
-                    file.flush()
-                    self.done[outcome.seed] = outcome
-
+            with self._appending(self.folder / _OUTCOMES) as add:
                 yield add
+
+    @contextmanager
+    def sharing(self, shard: int, shards: int) -> Iterator[Callable[[Outcome], None]]:
+        """As :meth:`writing`, for one of ``shards`` processes that play their shares at the same time.
+
+        Raises:
+            BusyError: another process plays this share.
+            ValueError, FileExistsError: as for the class, if another process wrote here since.
+            UserError: while adding; the folder was removed, because another process finished the evaluation.
+        """
+        self._unfinished.begin_share()
+        folder = self.folder / _SHARDS / f"{shard}-of-{shards}"
+        with exclusively(folder, f"playing shard {shard} of {shards}"):
+            self.done = self._read()
+            with self._appending(folder / _OUTCOMES) as add:
+                yield add
+
+    @contextmanager
+    def _appending(self, path: Path) -> Iterator[Callable[[Outcome], None]]:
+        """Gives a function that adds an outcome to a file of outcomes."""
+        _drop_half_line(path)
+        with path.open("a") as file:
+
+            def add(outcome: Outcome) -> None:
+                if not path.exists():
+                    raise UserError(f"{path.parent} was removed by another process, which finished the evaluation")
+                file.write(json.dumps(asdict(outcome)) + "\n")
+                file.flush()
+                self.done[outcome.seed] = outcome
+
+            yield add
 
     def finish(self) -> None:
         """Rename the folder to the output: all is written. Call it within :meth:`writing`, which keeps others out.
@@ -64,7 +93,14 @@ class Journal:
         Raises:
             OSError: a file, or a folder that is not empty, is at the output by now; the folder stays.
         """
-        self._unfinished.finish(_OUTCOMES)
+        self._unfinished.finish(_OUTCOMES, _SHARDS)
+
+
+def _drop_half_line(path: Path) -> None:
+    """Cut off what a process had written of a line when it ended: what is added must not be appended to that."""
+    text = path.read_bytes() if path.exists() else b""
+    if text and not text.endswith(b"\n"):
+        write_atomically(path, lambda file: file.write(text[: text.rfind(b"\n") + 1]))
 
 
 def _read_outcomes(path: Path) -> Iterator[Outcome]:

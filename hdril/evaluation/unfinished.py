@@ -66,9 +66,21 @@ class UnfinishedFolder:
             with self._removed_unless(lambda: self._holds_more_than(_LOCK), missing):  # refused: the lock was made here
                 self._check()
             with self._removed_unless(begun or (lambda: self._holds_more_than(self._record, _LOCK)), missing):
-                record = json.dumps({self._key: self._identity} if self._key else self._identity, indent=2)
-                write_atomically(self.folder / self._record, lambda file: file.write(record.encode()))
+                self._write_record()
                 yield
+
+    def begin_share(self) -> None:
+        """Make the folder ready for a part of the results, which other processes may make beside others.
+
+        Raises:
+            ValueError, FileExistsError: as for the class, if another process wrote here since.
+        """
+        self._check()
+        self._write_record()
+
+    def _write_record(self) -> None:
+        record = json.dumps({self._key: self._identity} if self._key else self._identity, indent=2)
+        write_atomically(self.folder / self._record, lambda file: file.write(record.encode()))
 
     @contextmanager
     def _removed_unless(self, kept: Callable[[], bool], made: list[Path]) -> Iterator[None]:
@@ -84,12 +96,12 @@ class UnfinishedFolder:
             raise
 
     def finish(self, *scratch: str) -> None:
-        """Rename the folder to the output, without the files ``scratch``: all is written. Call it within :meth:`writing`,
+        """Rename the folder to the output, without ``scratch``, files or folders: all is written. Call it within :meth:`writing`,
         which keeps others out.
 
         Raises:
             OSError: a file, or a folder that is not empty, is at ``output`` by now; the folder stays.
         """
-        for name in (self._record, *scratch, _LOCK):
-            (self.folder / name).unlink(missing_ok=True)
+        for path in (self.folder / name for name in (self._record, *scratch, _LOCK)):
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
         self.folder.replace(self.output)

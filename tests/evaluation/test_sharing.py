@@ -1,0 +1,197 @@
+"""Evaluations in shards: the same results whoever plays which seeds, in any order, after kills, and on real clusters."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from hdril.cli.eval import EvalConfig, PolicySource, eval_command
+from hdril.errors import UserError
+from hdril.evaluation import evaluate
+from hdril.evaluation.evaluate import make_job
+from hdril.evaluation.journal import Journal
+from hdril.files import BusyError
+from tests.evaluation.checkpoints import experts_episode, listing, save_hdril, save_replay
+from tests.evaluation.synthetic import outcome
+
+SEED, COUNT = 930_000, 3
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory):
+    """A cache of the expert's episodes that all tests of this module share."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy that plays what the expert did on the first seed."""
+    return save_replay(tmp_path_factory.mktemp("policies") / "replay", experts_episode(SEED).action)
+
+
+def play(policy: Path, output: Path, **options) -> None:
+    given = {"num_episodes": COUNT, "seed": SEED, "workers": 1, "rerun": "none", "output_dir": output}
+    eval_command(EvalConfig(PolicySource(str(policy)), **(given | options)))
+
+
+@pytest.fixture(scope="module")
+def alone(policy: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """What one process writes, recordings of all episodes included."""
+    output = tmp_path_factory.mktemp("alone") / "eval"
+    play(policy, output, rerun="all")
+    return reports(output)
+
+
+def reports(output: Path) -> dict[str, bytes]:
+    """The files of an evaluation that must be the same to the last byte; of recordings, which hold times, the names."""
+    return {name: b"" if name.endswith(".rrd") else data for name, data in listing(output).items()}
+
+
+@pytest.fixture
+def played(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Seeds that a policy played, in order."""
+    seeds: list[int] = []
+    play_one = evaluate.Worker.play
+
+    def noting(self: evaluate.Worker, seed: int) -> evaluate.EvaluatedEpisode:
+        seeds.append(seed)
+        return play_one(self, seed)
+
+    monkeypatch.setattr(evaluate.Worker, "play", noting)
+    return seeds
+
+
+def test_shards_of_any_number_and_order_make_the_same_report(
+    policy: Path, alone: dict[str, bytes], tmp_path: Path, played: list[int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "eval"
+    for shard, shards, seeds in ((2, 3, [SEED + 2]), (0, 2, [SEED]), (1, 2, [SEED + 1]), (2, 3, [])):
+        play(policy, output, rerun="all", shards=shards, shard=shard)
+        assert played == seeds, (shard, shards)
+        played.clear()
+        assert not output.exists()
+    assert "Shard 2 of 3 is played; the same command without --shard makes the report" in capsys.readouterr().out
+    play(policy, output, rerun="all", shards=2)
+    assert not played, "all was there"
+    assert reports(output) == alone
+    assert [path.name for path in tmp_path.iterdir()] == ["eval"]
+
+
+def test_what_a_killed_shard_left_is_kept_and_the_rest_is_played(
+    policy: Path, alone: dict[str, bytes], tmp_path: Path, played: list[int]
+) -> None:
+    output = tmp_path / "eval"
+    play(policy, output, rerun="all", shards=1, shard=0)
+    path = tmp_path / "eval.partial/shards/0-of-1/outcomes.jsonl"
+    first, second, _ = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(first + second[:40])
+    played.clear()
+    play(policy, output, rerun="all", shards=1, shard=0)
+    assert played == [SEED + 1, SEED + 2]
+    assert path.read_bytes().splitlines(keepends=True)[:2] == [first, second]
+    played.clear()
+    play(policy, output, rerun="all")
+    assert not played
+    assert reports(output) == alone
+
+
+def test_a_suite_in_shards(policy: Path, tmp_path: Path, played: list[int]) -> None:
+    options = {"suite": "factors", "cells": "push", "num_episodes": 2}
+    play(policy, tmp_path / "alone", **options)
+    assert len(played) == 6, "nominal, push and its control"
+    played.clear()
+    output = tmp_path / "suite"
+    for shard in (1, 0):
+        play(policy, output, **options, shards=2, shard=shard)
+    assert sorted(played) == sorted([SEED, SEED + 1] * 3)
+    played.clear()
+    play(policy, output, **options)
+    assert not played
+    assert reports(output) == reports(tmp_path / "alone")
+
+
+def test_shards_of_other_weights_are_refused(policy: Path, tmp_path: Path) -> None:
+    output = tmp_path / "eval"
+    play(policy, output, shards=3, shard=0)
+    other = save_replay(tmp_path / "other", experts_episode(SEED).action[:60])
+    before = listing(tmp_path)
+    for options in ({"shard": 1}, {}):
+        with pytest.raises(ValueError, match=r"eval\.partial holds results of other weights"):
+            play(other, output, shards=3, **options)
+    assert listing(tmp_path) == before
+
+
+def test_a_shard_is_played_once_at_a_time_and_says_when_it_is_late(policy: Path, tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "eval", make_job("table_lift", str(policy), SEED, COUNT).identity)
+    with journal.sharing(0, 2) as add:
+        with pytest.raises(BusyError, match=r"another process is playing shard 0 of 2"), journal.sharing(0, 2):
+            pass
+        with journal.sharing(1, 2) as add_other:  # two shards at once
+            add_other(outcome(SEED + 1))
+            add(outcome(SEED))
+        with journal.writing():
+            assert set(journal.done) == {SEED, SEED + 1}
+            journal.finish()
+        with pytest.raises(UserError, match="was removed by another process, which finished the evaluation"):
+            add(outcome(SEED + 2))
+    assert [path.name for path in (tmp_path / "eval").iterdir()] == []
+
+
+def test_options_that_do_nothing_together_are_refused(policy: Path, tmp_path: Path) -> None:
+    for options, words in (
+        ({"shards": 2, "shard": 2}, "shard must be from 0 to 1, got 2"),
+        ({"shards": 2, "shard": 0, "push": "a/b"}, "--push comes when all is there"),
+        ({"shards": 2, "shard": 0, "executor": "ray"}, "--shard plays here"),
+        ({"executor": "lsf"}, "executor must be local, slurm, ray"),
+    ):
+        with pytest.raises((ValueError, UserError), match=words):
+            play(policy, tmp_path / "eval", **options)
+    assert not list(tmp_path.iterdir())
+
+
+# ---------------------------------------------------------------- real clusters
+
+
+@pytest.fixture(scope="module")
+def untrained(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """HDR-IL that other processes can load."""
+    return save_hdril(tmp_path_factory.mktemp("untrained") / "policy", dataset)
+
+
+def command(policy: Path, output: Path, *options: str) -> str:
+    line = [Path(sys.executable).with_name("hdril-eval"), f"--policy.path={policy}", f"--num_episodes={COUNT}",
+            f"--seed={SEED}", f"--output_dir={output}", "--rerun=none", "--workers=2", *options]  # fmt: skip
+    return subprocess.run(line, check=True, capture_output=True, text=True).stdout
+
+
+@pytest.mark.long
+def test_ray_gives_the_same_results(untrained: Path, tmp_path: Path) -> None:
+    pytest.importorskip("ray", reason="Ray is an extra")
+    command(untrained, tmp_path / "alone")
+    command(untrained, tmp_path / "eval", "--executor=ray", "--shards=3")
+    assert reports(tmp_path / "eval") == reports(tmp_path / "alone")
+
+
+@pytest.mark.long
+@pytest.mark.skipif(shutil.which("sinfo") is None, reason="there is no Slurm here")
+def test_slurm_gives_the_same_results(untrained: Path, tmp_path: Path) -> None:
+    listed = subprocess.run(["sinfo", "-h", "-o", "%R"], capture_output=True, text=True, check=False)
+    if listed.returncode or not listed.stdout.split():
+        pytest.skip("there is no Slurm here that answers")
+    command(untrained, tmp_path / "alone")
+    output, partition = tmp_path / "eval", listed.stdout.split()[0]
+    said = command(untrained, output, "--executor=slurm", "--shards=3", f"--slurm.partition={partition}")
+    assert "Submitted 3 shards as job " in said
+    waiting = time.monotonic() + 300
+    while not output.exists() and time.monotonic() < waiting:
+        time.sleep(1)
+    assert reports(output) == reports(tmp_path / "alone")
+    assert len(json.loads((output / "results.json").read_text())["per_episode"]) == COUNT
