@@ -106,8 +106,8 @@ def record(
             shards = Shards(partial, recipe, first_seed)
             selection = _Selection(num_episodes, progress)
             _fill(selection, shards, lambda seed: episodes(recipe, seed, workers), first_seed)
-            provenance = Provenance(recipe, tuple(episode.seed for episode in selection.kept), selection.dropped)
-            provenance = _publish(provenance, selection.kept, partial, root, words)
+            provenance = Provenance(recipe, tuple(selection.kept), selection.dropped)
+            provenance = _publish(provenance, shards, partial, root, words)
         except BaseException as error:
             if isinstance(error, ExpertError) or not any(partial.glob("*.npz")):
                 shutil.rmtree(partial)  # there is nothing to go on from
@@ -168,10 +168,13 @@ def refuse_existing(root: Path) -> None:
 
 
 class _Selection:
-    """Keeps successful episodes until there are ``wanted``, and drops the others."""
+    """Keeps the seeds of successful episodes until there are ``wanted``, and drops the others.
+
+    The episodes are on disk: of a million, memory holds none.
+    """
 
     def __init__(self, wanted: int, progress: Callable[[int, int], None] | None) -> None:
-        self.kept: list[Episode] = []
+        self.kept: list[int] = []
         self.dropped: dict[int, str] = {}
         self._wanted, self._progress = wanted, progress
 
@@ -181,7 +184,7 @@ class _Selection:
 
     def add(self, episode: Episode) -> None:
         if episode.success:
-            self.kept.append(episode)
+            self.kept.append(episode.seed)
         else:
             self.dropped[episode.seed] = episode.unmet
         if len(self.dropped) > PATIENCE + len(self.kept):
@@ -214,11 +217,11 @@ def _fill(selection: _Selection, shards: Shards, stream: Callable[[int], Generat
     raise ValueError(f"only {len(selection.kept)} demonstrations succeeded up to the largest seed; choose a lower seed")
 
 
-def _publish(provenance: Provenance, kept: list[Episode], partial: Path, root: Path, words: bool) -> Provenance:
+def _publish(provenance: Provenance, shards: Shards, partial: Path, root: Path, words: bool) -> Provenance:
     """Write the dataset beside its place and move it there when it is whole; returns its provenance with its digest."""
     staged = partial / "dataset"
     shutil.rmtree(staged, ignore_errors=True)
-    provenance = write_dataset(staged, provenance, kept)
+    provenance = write_dataset(staged, provenance, map(shards.get, provenance.seeds))
     if words:
         add_words(staged)
     root.parent.mkdir(parents=True, exist_ok=True)

@@ -53,6 +53,15 @@ class Shards:
         arrays = {name: np.asarray(value) for name, value in vars(episode).items()}
         write_atomically(self.path(episode.seed), lambda file: np.savez(file, allow_pickle=False, **arrays))
 
+    def get(self, seed: int) -> Episode:
+        """The episode of a seed.
+
+        Raises:
+            FileNotFoundError: it is not there.
+            ValueError, KeyError, EOFError, zipfile.BadZipFile: it cannot be read.
+        """
+        return _load(self.path(seed), seed)
+
     def take(self, first_seed: int | None = None) -> Iterator[Episode]:
         """Episodes from a seed on, the first of all unless given, up to the first that is not there or cannot be read.
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hdril.demonstrations.content import content, dataset_digest, episode_digest
 from hdril.demonstrations.episode import Episode
@@ -25,11 +27,19 @@ from hdril.demonstrations.schema import (
 from hdril.env import BimanualEnv
 from hdril.tasks import Task, get_task
 
+if TYPE_CHECKING:
+    import pyarrow as arrow
+    from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+    from pyarrow import parquet
 
-def write_dataset(root: Path, provenance: Provenance, episodes: list[Episode]) -> Provenance:
+
+def write_dataset(
+    root: Path, provenance: Provenance, episodes: Iterable[Episode], file_mb: int | None = None
+) -> Provenance:
     """Write the episodes, which are those of ``provenance`` and in its order, as a new dataset at ``root``.
 
-    Returns the provenance with the digest of the episodes, as it was written.
+    Returns the provenance with the digest of the episodes, as it was written. One episode is in memory at a time. A file of
+    frames is closed when it has ``file_mb`` MB or more; LeRobot's own number unless given.
 
     The tables are written here and not through ``LeRobotDataset.add_frame``, which spends most of its time on looking
     for images in each frame: this is six times as fast and gives the same files.
@@ -41,56 +51,89 @@ def write_dataset(root: Path, provenance: Provenance, episodes: list[Episode]) -
     metadata = LeRobotDatasetMetadata.create(
         # A dataset on disk does not hold its repository's name, but LeRobot asks for one.
         "local/dataset", BimanualEnv.metadata["render_fps"], features(recipe), recipe.robot, root, use_videos=False,
-        metadata_buffer_size=1000,
+        metadata_buffer_size=1000, data_files_size_in_mb=file_mb,
     )  # fmt: skip
     metadata.save_episode_tasks([task.description])
-    digests = _write_episodes(metadata, task, episodes)
+    digests, frames = _write_episodes(metadata, task, episodes)
     metadata.finalize()
-    _write_names(root, task, episodes)
+    _write_names(root, task, frames)
     provenance = replace(provenance, digest=dataset_digest(digests))
     write_provenance(root, provenance)
     return provenance
 
 
-def _write_episodes(metadata: Any, task: Task, episodes: list[Episode]) -> list[str]:
-    """Write frames and the table of episodes; returns the digests of the episodes."""
+def _write_episodes(
+    metadata: LeRobotDatasetMetadata, task: Task, episodes: Iterable[Episode]
+) -> tuple[list[str], NDArray[np.int64]]:
+    """Write frames and the table of episodes; returns the digests of the episodes, and how many frames have each label."""
     import pyarrow as arrow
-    import pyarrow.parquet as parquet
     from lerobot.datasets.compute_stats import compute_episode_stats
     from lerobot.datasets.feature_utils import get_hf_features_from_features
 
     columns = get_hf_features_from_features(metadata.features)
-    place = {"data/chunk_index": 0, "data/file_index": 0}
-    path = metadata.root / metadata.data_path.format(chunk_index=0, file_index=0)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    start, digests = 0, []
-    with parquet.ParquetWriter(path, columns.arrow_schema) as writer:
+    start, digests, played = 0, [], np.zeros(len(task.labels), np.int64)
+    with closing(_DataFiles(metadata, columns.arrow_schema)) as files:
         for index, episode in enumerate(episodes):
             frames = content(episode)
             digests.append(episode_digest(frames, episode.seed, episode.scenario))
             frames |= _places(len(episode), index, start, metadata.fps)
             # Not Dataset.from_dict, which spends 50 ms on a fingerprint of each episode.
             table = arrow.Table.from_pydict({key: list(frames[key]) for key in columns}, schema=columns.arrow_schema)
-            writer.write_table(table)
+            place = files.write(table)
             values: dict[str, list[str] | np.ndarray] = {key: frames[key] for key in metadata.features}
             stats = compute_episode_stats(values, metadata.features)
             told = {SEED: episode.seed, SCENARIO: episode.scenario, DIGEST: digests[-1]}
             row = place | told | _segments(episode, task.labels)
             metadata.save_episode(index, len(episode), [task.description], stats, row)
             start += len(episode)
-    return digests
+            played += np.bincount(episode.label, minlength=len(task.labels))
+    return digests, played
 
 
-def _write_names(root: Path, task: Task, episodes: list[Episode]) -> None:
-    """The names of task and primitives, and the primitives' shares of an episode."""
+class _DataFiles:
+    """The files of frames, one after the other."""
+
+    def __init__(self, metadata: LeRobotDatasetMetadata, schema: arrow.Schema) -> None:
+        self._metadata, self._schema = metadata, schema
+        self._chunk, self._file = 0, 0
+        self._sink: arrow.OSFile | None = None
+        self._writer: parquet.ParquetWriter | None = None
+
+    def write(self, table: arrow.Table) -> dict[str, int]:
+        """Write an episode's frames; returns where it is, in the columns of the table of episodes."""
+        import pyarrow as arrow
+        import pyarrow.parquet as parquet
+        from lerobot.datasets.utils import update_chunk_file_indices
+
+        meta = self._metadata
+        if self._sink is not None and self._sink.tell() >= meta.data_files_size_in_mb * 2**20:
+            self.close()
+            self._chunk, self._file = update_chunk_file_indices(self._chunk, self._file, meta.chunks_size)
+        if self._writer is None:
+            path = meta.root / meta.data_path.format(chunk_index=self._chunk, file_index=self._file)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._sink = arrow.OSFile(str(path), "wb")
+            self._writer = parquet.ParquetWriter(self._sink, self._schema)
+        self._writer.write_table(table)
+        return {"data/chunk_index": self._chunk, "data/file_index": self._file}
+
+    def close(self) -> None:
+        """Finish the file that is open."""
+        if self._writer is not None and self._sink is not None:
+            self._writer.close()
+            self._sink.close()
+        self._writer = self._sink = None
+
+
+def _write_names(root: Path, task: Task, frames: NDArray[np.int64]) -> None:
+    """The names of task and primitives, and the primitives' shares of an episode, of which ``frames`` are played."""
     import pandas as pd
 
     # Rerun's loader looks for the column that pandas makes of an index without a name, LeRobot reads it under any name.
     tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([task.description]))
     tasks.to_parquet(root / "meta/tasks.parquet")
     write_primitives(root, task.labels)
-    played = np.concatenate([episode.label for episode in episodes])
-    shares = {name: float((played == label).mean()) for label, name in enumerate(task.labels)}
+    shares = dict(zip(task.labels, (frames / frames.sum()).tolist(), strict=True))
     (root / PROPORTIONS_PATH).write_text(json.dumps(shares, indent=2))
 
 

@@ -67,12 +67,12 @@ def pushed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_a_dataset_whose_first_seed_was_dropped_is_known_again(made_up, pushed: list[str], tmp_path: Path) -> None:
     root = tmp_path / "set"
     write_dataset(root, Provenance(Recipe("table_lift"), (6, 7), {5: "table upright"}), [made_up(6), made_up(7)])
-    record_command(RecordConfig("user/name", num_episodes=2, seed=5, root=root, push=True))
+    record_command(RecordConfig(repo_id="user/name", num_episodes=2, seed=5, root=root, push=True))
     assert pushed == ["user/name"]
     for other in ({"seed": 6}, {"num_episodes": 3}, {"task": "peg_in_hole"}):
         options: dict[str, Any] = {"num_episodes": 2, "seed": 5} | other
         with pytest.raises(FileExistsError, match="holds something else"):
-            record_command(RecordConfig("user/name", root=root, push=True, **options))
+            record_command(RecordConfig(repo_id="user/name", root=root, push=True, **options))
     assert pushed == ["user/name"]
 
 
@@ -82,5 +82,5 @@ def test_a_dataset_of_another_version_is_not_published_as_made_by_this_one(
     root = tmp_path / "set"
     write_dataset(root, Provenance(Recipe("table_lift"), (5,), hdril_version="0.0.9"), [made_up(5)])
     with pytest.raises(FileExistsError, match=rf"was recorded by hdril 0\.0\.9, not by {re.escape(__version__)}"):
-        record_command(RecordConfig("user/name", num_episodes=1, seed=5, root=root, push=True))
+        record_command(RecordConfig(repo_id="user/name", num_episodes=1, seed=5, root=root, push=True))
     assert pushed == []

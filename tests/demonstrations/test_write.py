@@ -67,6 +67,27 @@ def test_lerobot_reads_it_with_its_statistics(written: Written) -> None:
     assert [row["seed"] for row in loaded.meta.episodes] == [7, 9]
 
 
+def test_files_are_closed_when_they_are_full(made_up: Callable[..., Episode], tmp_path: Path) -> None:
+    """Half a MB an episode, in files of 1 MB; the episodes come one at a time."""
+    frames, count, root = 2500, 7, tmp_path / "set"
+    provenance = Provenance(Recipe("table_lift"), tuple(range(count)))
+    made = write_dataset(root, provenance, (made_up(seed, frames) for seed in range(count)), file_mb=1)
+    files = sorted(path.relative_to(root / "data") for path in (root / "data").rglob("*.parquet"))
+    assert len(files) >= 3
+    assert [path.name for path in files] == [f"file-{i:03d}.parquet" for i in range(len(files))]
+    loaded = LeRobotDataset("any/name", root=root)
+    assert loaded.num_frames == len(loaded.hf_dataset) == count * frames
+    places = [(row["data/chunk_index"], row["data/file_index"]) for row in loaded.meta.episodes]
+    assert places == sorted(places)
+    assert len(set(places)) == len(files)
+    for index, (chunk, file) in enumerate(places):
+        there = pd.read_parquet(root / f"data/chunk-{chunk:03d}/file-{file:03d}.parquet", columns=["episode_index"])
+        assert index in set(there["episode_index"])
+    np.testing.assert_array_equal(loaded[5 * frames + 3]["action"].numpy(), made_up(5, frames).action[3])
+    whole = write_dataset(tmp_path / "whole", provenance, [made_up(seed, frames) for seed in range(count)])
+    assert whole.digest == made.digest
+
+
 def test_segments_go_from_start_to_start_ends_included(written: Written) -> None:
     row = LeRobotDataset("any/name", root=written[0]).meta.episodes[1]
     assert row["dense_subtask_names"] == ["move", "grasp", "move", "move"]

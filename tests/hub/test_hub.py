@@ -65,7 +65,7 @@ def squeeze(text: str) -> str:
 
 
 def push_dataset(dataset: Path, **options) -> None:
-    record_command(RecordConfig("user/lifts", num_episodes=6, root=dataset, workers=1, push=True, **options))
+    record_command(RecordConfig(repo_id="user/lifts", num_episodes=6, root=dataset, workers=1, push=True, **options))
 
 
 def test_dataset_is_published_whole_with_its_card(hub: FakeHub, dataset: Path) -> None:
@@ -97,7 +97,7 @@ def test_pushing_again_moves_the_tag(hub: FakeHub, dataset: Path) -> None:
 
 def test_another_dataset_than_asked_for_is_not_pushed(hub: FakeHub, dataset: Path) -> None:
     with pytest.raises(FileExistsError, match="holds something else"):
-        record_command(RecordConfig("user/lifts", num_episodes=5, root=dataset, push=True))
+        record_command(RecordConfig(repo_id="user/lifts", num_episodes=5, root=dataset, push=True))
     assert not hub.requests
 
 
