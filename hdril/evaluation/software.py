@@ -106,9 +106,12 @@ def policy_software(policy_class: type) -> dict[str, str]:
     """What decides a policy's actions, its weights aside: torch, LeRobot, and the package that defines the policy."""
     software = {"lerobot": distribution_version("lerobot"), "torch": distribution_version("torch")}
     package = policy_class.__module__.partition(".")[0]
-    if package not in software:
-        software[package] = f"{distribution_version(package)} ({_package_digest(package)})"
-    return software
+    return software if package in software else software | package_software(package)
+
+
+def package_software(package: str) -> dict[str, str]:
+    """Version of a package that may be installed in place, with the digest of its sources."""
+    return {package: f"{distribution_version(package)} ({_package_digest(package)})"}
 
 
 @cache

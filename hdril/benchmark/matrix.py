@@ -1,0 +1,223 @@
+"""The matrix of a benchmark: which policies learn from which demonstrations, and on which seeds they are compared."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hdril.benchmark.steps import Evaluate, Record, Train
+from hdril.files import MAX_SEED
+from hdril.tasks import base_name, get_task
+
+
+@dataclass
+class DataSpec:
+    """Demonstrations."""
+
+    task: str
+    """Name of the task, with its parameters (table_lift:level=varied)."""
+    episodes: int
+    """Episodes to record."""
+    seed: int = 0
+    """First seed."""
+    events: str = ""
+    """What happens to the demonstrations, as hdril-record has it."""
+    perturb: float = 0.0
+    """Noise that the robot gets and the record does not, m, as hdril-record has it."""
+
+
+@dataclass
+class PolicySpec:
+    """A policy, and how it is trained."""
+
+    steps: int
+    """Steps of training."""
+    config: Path = Path("configs/train/table_lift.yaml")
+    """Config file of lerobot-train."""
+    options: list[str] = field(default_factory=list)
+    """Further options of lerobot-train."""
+
+
+@dataclass
+class EvaluationSpec:
+    """Seeds of a task on which policies are evaluated."""
+
+    task: str
+    """Name of the task, with its parameters."""
+    episodes: int
+    """Seeds."""
+    seed: int
+    """First seed. No training and no tuning may use these seeds."""
+    options: list[str] = field(default_factory=list)
+    """Further options of hdril-eval, such as --policy.rollout=open_loop."""
+    tuning: bool = False
+    """Whether choices are made by the results: such seeds are refused where results are reported."""
+
+
+@dataclass
+class TableSpec:
+    """A table: rows are policies on demonstrations, columns are evaluations."""
+
+    title: str
+    """Its heading."""
+    data: list[str]
+    """Names of demonstrations."""
+    policies: list[str]
+    """Names of policies."""
+    evaluations: list[str]
+    """Names of evaluations."""
+    demonstrations: list[int] = field(default_factory=list)
+    """How many of the demonstrations are learned from, the first ones; all unless given."""
+    training_seeds: list[int] = field(default_factory=lambda: [1000])
+    """Seeds of weights and batches, one training each."""
+    against: str = ""
+    """The policy that the others are compared with, on the same demonstrations and seeds."""
+    note: str = ""
+    """What a reader should know, as Markdown."""
+
+
+@dataclass
+class Matrix:
+    """All that a benchmark does."""
+
+    name: str
+    """Of the benchmark."""
+    data: dict[str, DataSpec]
+    """Demonstrations by name."""
+    policies: dict[str, PolicySpec]
+    """Policies by name."""
+    evaluations: dict[str, EvaluationSpec]
+    """Evaluations by name."""
+    tables: list[TableSpec]
+    """What is reported."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of a table: a policy that was trained once for each training seed."""
+
+    data: str
+    policy: str
+    demonstrations: int
+    evaluations: Mapping[str, tuple[Evaluate, ...]]
+    """By name; one for each training seed."""
+
+    @property
+    def trainings(self) -> tuple[Train, ...]:
+        return tuple(step.policy for step in next(iter(self.evaluations.values())))
+
+
+def rows(matrix: Matrix, table: TableSpec) -> Iterator[Row]:
+    """The rows of a table, with the steps that fill them."""
+    for name in table.data:
+        spec = matrix.data[name]
+        record = Record(spec.task, spec.episodes, spec.seed, spec.events, spec.perturb)
+        for count in table.demonstrations or [spec.episodes]:
+            for policy in table.policies:
+                made = matrix.policies[policy]
+                trained = [
+                    Train(policy, record, count, made.config, tuple(made.options), made.steps, seed)
+                    for seed in table.training_seeds
+                ]
+                evaluations = {
+                    key: tuple(_evaluate(matrix, key, train) for train in trained) for key in table.evaluations
+                }
+                yield Row(name, policy, count, evaluations)
+
+
+def _evaluate(matrix: Matrix, name: str, policy: Train) -> Evaluate:
+    spec = matrix.evaluations[name]
+    return Evaluate(name, policy, spec.task, spec.episodes, spec.seed, tuple(spec.options))
+
+
+def steps(matrix: Matrix) -> list[Evaluate]:
+    """The evaluations of all tables, each of which is made from all that comes before it."""
+    found = {step: None for table in matrix.tables for row in rows(matrix, table) for entry in row.evaluations.values()
+             for step in entry}  # fmt: skip
+    return list(found)
+
+
+def check(matrix: Matrix) -> None:
+    """Check a matrix; nothing is done.
+
+    Raises:
+        ValueError: a name that is not there, a number out of range, or seeds of an evaluation that are not held out; says which,
+            and the valid choices.
+        FileNotFoundError: there is no such config file.
+    """
+    for name, data in matrix.data.items():
+        get_task(data.task)
+        _check_seeds(f"data {name}", data.seed, data.episodes)
+    for name, policy in matrix.policies.items():
+        if not policy.config.exists():
+            raise FileNotFoundError(f"policy {name}: there is no config file {policy.config}")
+        if policy.steps < 1:
+            raise ValueError(f"policy {name}: steps must be at least 1, got {policy.steps}")
+    for name, evaluation in matrix.evaluations.items():
+        get_task(evaluation.task)
+        _check_seeds(f"evaluation {name}", evaluation.seed, evaluation.episodes)
+    for table in matrix.tables:
+        _check_table(matrix, table)
+    check_held_out(matrix)
+
+
+def _check_seeds(what: str, first: int, count: int) -> None:
+    if count < 1:
+        raise ValueError(f"{what}: episodes must be at least 1, got {count}")
+    if not 0 <= first <= MAX_SEED + 1 - count:
+        raise ValueError(f"{what}: seed must be from 0 to {MAX_SEED + 1 - count}, got {first}")
+
+
+def _check_table(matrix: Matrix, table: TableSpec) -> None:
+    for kind, names, known in (
+        ("data", table.data, matrix.data),
+        ("policies", table.policies, matrix.policies),
+        ("evaluations", table.evaluations, matrix.evaluations),
+        ("against", [table.against] if table.against else [], table.policies),
+    ):
+        if missing := [name for name in names if name not in known]:
+            raise ValueError(f"table {table.title!r}: {kind} has no {missing[0]!r}; choose from: {', '.join(known)}")
+        if not names and kind != "against":
+            raise ValueError(f"table {table.title!r} names no {kind}; choose from: {', '.join(known)}")
+    if not table.training_seeds:
+        raise ValueError(f"table {table.title!r} names no training_seeds")
+    for name in table.data:
+        most = matrix.data[name].episodes
+        if wrong := [count for count in table.demonstrations if not 1 <= count <= most]:
+            raise ValueError(f"table {table.title!r}: data {name} has 1 to {most} demonstrations, got {wrong[0]}")
+        task = base_name(matrix.data[name].task)
+        if other := [key for key in table.evaluations if base_name(matrix.evaluations[key].task) != task]:
+            raise ValueError(f"table {table.title!r}: evaluation {other[0]} is not of {task}, the task of data {name}")
+
+
+def check_held_out(matrix: Matrix) -> None:
+    """Check that the seeds of what is reported were neither trained nor tuned on.
+
+    A seed decides the whole scene of a task, whatever its parameters, so that the level does not matter.
+
+    Raises:
+        ValueError: they were; names both uses.
+    """
+    used = [
+        *((f"data {name}", base_name(spec.task), _seeds(spec)) for name, spec in matrix.data.items()),
+        *((f"tuning on {name}", base_name(e.task), _seeds(e)) for name, e in matrix.evaluations.items() if e.tuning),
+    ]
+    for name, evaluation in matrix.evaluations.items():
+        if evaluation.tuning:
+            continue
+        seeds, task = _seeds(evaluation), base_name(evaluation.task)
+        for use, other, theirs in used:
+            common = range(max(seeds.start, theirs.start), min(seeds.stop, theirs.stop))
+            if other == task and common:
+                raise ValueError(
+                    f"evaluation {name} is not held out: {use} has its seeds {common.start} to {common[-1]} of {task}, too"
+                )
+    for table in matrix.tables:
+        if tuned := [name for name in table.evaluations if matrix.evaluations[name].tuning]:
+            raise ValueError(f"table {table.title!r}: {tuned[0]} is for tuning, and is not reported")
+
+
+def _seeds(spec: DataSpec | EvaluationSpec) -> range:
+    # Demonstrations that fail are dropped, and further seeds take their place: at most half of them fail.
+    return range(spec.seed, spec.seed + spec.episodes * (2 if isinstance(spec, DataSpec) else 1))

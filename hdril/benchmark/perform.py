@@ -1,0 +1,109 @@
+"""Does one step in a process of its own, which ends with the one that started it, and takes the command with it.
+
+``python -m hdril.benchmark.perform`` reads the step from standard input. When that is closed, the process that started it is
+gone: a command that went on would write beside the one that is started next.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+from hdril.benchmark.steps import Folders, Step
+from hdril.benchmark.store import DONE, LOG, RESULT, mark_done
+from hdril.files import BusyError, exclusively
+
+BUSY = os.EX_TEMPFAIL
+"""Exit code if another process does the step."""
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """A step, where it is done, and what it is made from."""
+
+    step: Step
+    place: Path
+    inputs: Folders
+    made_from: dict[str, Any]
+
+
+def start(assignment: Assignment) -> subprocess.Popen[bytes]:
+    """Start a process that does the step. Its exit code is 0, :data:`BUSY`, or that of the command that failed."""
+    command = [sys.executable, "-m", "hdril.benchmark.perform"]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    assert process.stdin is not None
+    process.stdin.write(pickle.dumps(assignment))
+    process.stdin.flush()  # and stays open: that it is closed means that this process is gone
+    return process
+
+
+def perform(assignment: Assignment) -> int:
+    """Do a step, unless it is done by now. Returns the exit code of its command.
+
+    Raises:
+        BusyError: another process does it.
+        OSError, ValueError: the command succeeded, but its result is not whole.
+    """
+    step, place = assignment.step, assignment.place
+    with exclusively(place, f"doing {step.title}"):
+        if (place / DONE).exists():
+            return 0
+        output = place / RESULT
+        if not step.resumes:
+            shutil.rmtree(output, ignore_errors=True)
+        command = step.command(output, assignment.inputs)
+        begun = time.monotonic()
+        # A result without step.json is whole if the process was killed between the two: the command would refuse it.
+        code = 0 if step.resumes and output.exists() else _run(command, place / LOG)
+        if code == 0:
+            mark_done(place, step, assignment.made_from, shlex.join(command), time.monotonic() - begun)
+        return code
+
+
+def _run(command: list[str], log: Path) -> int:
+    """Run a command, its output into the log, until it ends or the process that started this one is gone."""
+    program = Path(sys.executable).parent / command[0]
+    # The matrices are small: a second thread slows training down, and another step has the other processor.
+    variables = os.environ | {"OMP_NUM_THREADS": "1", "HDRIL_DEBUG": "1"}
+    with log.open("ab") as file:
+        file.write(f"$ {shlex.join(command)}\n".encode())
+        file.flush()
+        process = subprocess.Popen(
+            [str(program) if program.exists() else command[0], *command[1:]],
+            stdin=subprocess.DEVNULL, stdout=file, stderr=file, env=variables, start_new_session=True,
+        )  # fmt: skip
+    Thread(target=_end_with_parent, args=(process,), daemon=True).start()
+    return process.wait()
+
+
+def _end_with_parent(process: subprocess.Popen[bytes]) -> None:
+    os.read(sys.stdin.fileno(), 1)  # not through sys.stdin, whose lock would be held when this process ends
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    os._exit(1)
+
+
+def main() -> None:
+    """Entry point."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the process that started this one
+    try:
+        code = perform(pickle.load(sys.stdin.buffer))
+    except BusyError:
+        code = BUSY
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

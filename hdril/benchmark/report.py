@@ -1,0 +1,92 @@
+"""A benchmark's results as Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from hdril.evaluation.statistics import TrainingSpread
+from hdril.markdown import table as markdown_table
+
+SIGNIFICANCE = 0.05
+"""Family-wise error of the tests of a table."""
+
+
+def markdown(results: Mapping[str, Any]) -> str:
+    """The report."""
+    machine = results["machine"]
+    blocks = [
+        f"# Benchmark: {results['name']}",
+        f"Made by `hdril-benchmark` of hdril {results['hdril_version']}, one thread a step, on {machine['cores']} cores "
+        f"({machine['processor']}, {machine['system']}). Success is in percent, with the 95 % interval (Wilson) over the seeds "
+        "for one trained policy. Several trainings are written as trainings × seeds: the mean, then the range and the standard "
+        "deviation over trainings. No seed of an evaluation was trained or tuned on. Commands stand at the end.",
+    ]
+    for table in results["tables"]:
+        blocks += [f"## {table['title']}", *([table["note"]] if table["note"] else []), _seeds(table), _rows(table)]
+        blocks += _tests(table)
+    blocks += ["## Commands", *_commands(results)]
+    return "\n\n".join(blocks) + "\n"
+
+
+def _seeds(table: Mapping[str, Any]) -> str:
+    told = [
+        f"`{name}`: `{spec['task']}`, {spec['episodes']} seeds from {spec['seed']} on"
+        + (f", `{' '.join(spec['options'])}`" if spec["options"] else "")
+        for name, spec in table["evaluations"].items()
+    ]
+    return f"Evaluations: {'; '.join(told)}. Training seeds: {', '.join(map(str, table['training_seeds']))}."
+
+
+def _rows(table: Mapping[str, Any]) -> str:
+    heads = ["policy", "trained on", "demonstrations", "minutes of training", *table["evaluations"]]
+    lines = []
+    for row in table["rows"]:
+        minutes = row["training_minutes"]
+        spent = f"{min(minutes):.1f}" if len(minutes) == 1 else f"{min(minutes):.1f} to {max(minutes):.1f}"
+        cells = (_cell(row["cells"][name]) for name in table["evaluations"])
+        lines.append([f"`{row['policy']}`", row["data"], row["demonstrations"], spent, *cells])
+    return markdown_table(heads, lines)
+
+
+def _cell(runs: Sequence[Mapping[str, Any]]) -> str:
+    if len(runs) > 1:
+        return str(TrainingSpread(tuple(run["n_success"] for run in runs), runs[0]["n_episodes"]))
+    (run,) = runs
+    low, high = run["pc_success_ci95"]
+    return f"{run['n_success']} of {run['n_episodes']}: {run['pc_success']:.1f} ({low:.1f} to {high:.1f})"
+
+
+def _tests(table: Mapping[str, Any]) -> list[str]:
+    if not table["tests"]:
+        return []
+    lines = []
+    for test in table["tests"]:
+        low, high = test["pc_difference_ci95"]
+        adjusted = test["p_values_holm"]
+        lines.append(
+            [
+                f"`{test['policy']}`", test["data"], test["demonstrations"], test["evaluation"],
+                f"{test['pc_difference']:+.1f} ({low:+.1f} to {high:+.1f})",
+                ", ".join("< 0.001" if p < 0.001 else f"{p:.2g}" for p in adjusted),
+                "yes" if max(adjusted) < SIGNIFICANCE else "not shown",
+            ]
+        )  # fmt: skip
+    count = sum(len(test["p_values"]) for test in table["tests"])
+    return [
+        f"Against `{table['against']}`, seed by seed: the difference in points with its 95 % interval (bootstrap over trainings "
+        f"and seeds), p of McNemar's exact test for each pair of trainings, adjusted by Holm's method for the {count} tests of "
+        f"the table, and whether all are below {SIGNIFICANCE}. One training of each tells two trained policies apart, "
+        "not two methods.",
+        markdown_table(["policy", "trained on", "demonstrations", "evaluation", "difference", "p", "differs"], lines),
+    ]
+
+
+def _commands(results: Mapping[str, Any]) -> list[str]:
+    """The commands under the numbers, once each; ``STORE`` stands for the folder of the results."""
+    found: dict[str, None] = {}
+    for table in results["tables"]:
+        for row in table["rows"]:
+            found |= dict.fromkeys(row["training_commands"])
+            found |= dict.fromkeys(run["command"] for runs in row["cells"].values() for run in runs)
+    return ["```\n" + "\n".join(found) + "\n```"]

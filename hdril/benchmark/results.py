@@ -1,0 +1,119 @@
+"""What a benchmark found, as plain data: ``benchmark.json``."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hdril import __version__
+from hdril.benchmark.matrix import EvaluationSpec, Matrix, Row, TableSpec, rows
+from hdril.benchmark.steps import Evaluate
+from hdril.benchmark.store import Store
+from hdril.evaluation.statistics import bootstrap_difference, holm, mcnemar_exact, paired_counts
+from hdril.evaluation.stored import RESULTS
+
+_KEPT = ("n_episodes", "n_success", "pc_success", "pc_success_ci95", "held_out", "position_error_cm", "angle_error_rad",
+         "dtw_cm", "stages_reached")  # fmt: skip
+
+
+def collect(matrix: Matrix, store: Store) -> dict[str, Any]:
+    """The numbers of all tables, all of whose steps are done.
+
+    Raises:
+        KeyError: a step is not done.
+    """
+    return {
+        "name": matrix.name,
+        "hdril_version": __version__,
+        "machine": {"processor": platform.machine(), "system": platform.system(), "cores": os.cpu_count()},
+        "tables": [_table(matrix, table, store) for table in matrix.tables],
+    }
+
+
+def _table(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
+    found = [_row(row, store) for row in rows(matrix, table)]
+    return {
+        "title": table.title,
+        "note": table.note,
+        "evaluations": {name: vars(matrix.evaluations[name]) for name in table.evaluations},
+        "training_seeds": table.training_seeds,
+        "rows": found,
+        "against": table.against,
+        "tests": _tests(matrix, table, found),
+    }
+
+
+def _row(row: Row, store: Store) -> dict[str, Any]:
+    trainings = [store.get(step) for step in row.trainings]
+    return {
+        "data": row.data,
+        "policy": row.policy,
+        "demonstrations": row.demonstrations,
+        "steps": row.trainings[0].steps,
+        "training_minutes": [round(done.seconds / 60.0, 1) for done in trainings],
+        "training_commands": [store.relative(done.command) for done in trainings],
+        "cells": {name: [_run(step, store) for step in steps] for name, steps in row.evaluations.items()},
+    }
+
+
+def _run(step: Evaluate, store: Store) -> dict[str, Any]:
+    """One evaluation: its numbers, what was evaluated, and the command. ``failed_seeds`` lets a reader pair two policies."""
+    done = store.get(step)
+    results = json.loads((done.output / RESULTS).read_text())
+    return {key: results[key] for key in _KEPT} | {
+        "training_seed": step.policy.seed,
+        "weights": results["identity"]["policy"]["weights"],
+        "failed_seeds": [episode["seed"] for episode in results["per_episode"] if not episode["success"]],
+        "command": store.relative(done.command),
+    }
+
+
+def _outcomes(runs: Sequence[Mapping[str, Any]], evaluation: EvaluationSpec) -> NDArray[np.bool_]:
+    """(trainings, seeds) success of the runs of a cell."""
+    seeds = range(evaluation.seed, evaluation.seed + evaluation.episodes)
+    return np.array([[seed not in failed for seed in seeds] for failed in (set(run["failed_seeds"]) for run in runs)])
+
+
+def _tests(matrix: Matrix, table: TableSpec, found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Each policy against the one that the table names, on the same demonstrations and seeds."""
+    if not table.against:
+        return []
+    tests = []
+    for row, name in product(found, table.evaluations):
+        if row["policy"] == table.against:
+            continue
+        (base,) = (
+            other for other in found
+            if other["policy"] == table.against
+            and (other["data"], other["demonstrations"]) == (row["data"], row["demonstrations"])
+        )  # fmt: skip
+        first, second = (_outcomes(entry["cells"][name], matrix.evaluations[name]) for entry in (row, base))
+        named = {key: row[key] for key in ("data", "demonstrations", "policy")}
+        tests.append(named | {"evaluation": name} | _compare(first, second))
+    adjusted = iter(holm([p for test in tests for p in test["p_values"]]))
+    for test in tests:
+        test["p_values_holm"] = [next(adjusted) for _ in test["p_values"]]
+    return tests
+
+
+def _compare(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> dict[str, Any]:
+    """The difference of two policies with its interval, and p of each pair of trainings with the same seed.
+
+    Args:
+        first: (trainings, seeds) outcomes.
+        second: (trainings, seeds) outcomes.
+    """
+    low, high = bootstrap_difference(first, second)
+    pairs = zip(first.tolist(), second.tolist(), strict=True)
+    return {
+        "pc_difference": 100.0 * float(first.mean() - second.mean()),
+        "pc_difference_ci95": [100.0 * low, 100.0 * high],
+        "p_values": [mcnemar_exact(paired_counts(dict(enumerate(a)), dict(enumerate(b)))) for a, b in pairs],
+    }

@@ -1,0 +1,87 @@
+"""hdril-benchmark: policies, trained on demonstrations and evaluated on held-out seeds, by one config file."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tqdm import tqdm
+
+from hdril.benchmark.engine import Engine, Progress, in_order
+from hdril.benchmark.matrix import Matrix, check, steps
+from hdril.benchmark.report import markdown
+from hdril.benchmark.results import collect
+from hdril.benchmark.steps import Step
+from hdril.benchmark.store import Store
+from hdril.cli.common import run
+from hdril.files import write_atomically
+
+
+@dataclass
+class BenchmarkConfig(Matrix):
+    """Record, train and evaluate what a matrix names, and report it with statistics.
+
+    Results are kept by what they are made from. After Ctrl-C or a kill, the same command goes on, and a step whose options,
+    inputs or software changed is done anew. Several of these commands may run at once.
+    """
+
+    store: Path = Path("outputs/benchmark/store")
+    """Folder of all results."""
+    document: Path | None = None
+    """Where the report goes, without suffix: .md and .json. Default: outputs/benchmark/<name>."""
+    jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
+    """Steps at a time; each has one thread."""
+    plan: bool = False
+    """Do nothing: print what is done and what is left."""
+
+
+def benchmark_command(config: BenchmarkConfig) -> None:
+    """Do what is left, and report."""
+    check(config)
+    if config.jobs < 1:
+        raise ValueError(f"jobs must be at least 1, got {config.jobs}")
+    store, wanted = Store(config.store), steps(config)
+    if config.plan:
+        _print_plan(store, wanted)
+        return
+    with tqdm(total=len(in_order(wanted)), desc=config.name, unit="step") as bar:
+
+        def watch(step: Step, progress: Progress) -> None:
+            seconds = progress.remaining()
+            if progress.fresh:
+                bar.write(f"{store.get(step).seconds:6.0f} s  {step.title}")
+            bar.set_postfix_str("" if seconds is None else f"about {_in_words(seconds)} left")
+            bar.update()
+
+        Engine(store, config.jobs, watch).run(wanted)
+    results = collect(config, store)
+    document = config.document or Path("outputs/benchmark") / config.name
+    for suffix, text in ((".json", json.dumps(results, indent=1)), (".md", markdown(results))):
+        write_atomically(document.with_suffix(suffix), lambda file, text=text: file.write(text.encode()))
+    print(f"Report: {document.with_suffix('.md')}")
+
+
+def _in_words(seconds: float) -> str:
+    return f"{seconds / 60.0:.0f} minutes" if seconds < 7200 else f"{seconds / 3600.0:.1f} hours"
+
+
+def _print_plan(store: Store, wanted: Sequence[Step]) -> None:
+    ordered = in_order(wanted)
+    for step in ordered:
+        done = store.find(step)
+        print(
+            f"{'done' if done else 'left':5} {step.kind:9} {step.title}" + (f" ({done.seconds:.0f} s)" if done else "")
+        )
+    print(f"{sum(store.find(step) is not None for step in ordered)} of {len(ordered)} steps are done")
+
+
+def main() -> None:
+    """Entry point."""
+    run("hdril-benchmark", BenchmarkConfig, benchmark_command)
+
+
+if __name__ == "__main__":
+    main()

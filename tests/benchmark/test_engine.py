@@ -1,0 +1,159 @@
+"""Steps that are kept by what they are made from, and done once whoever is killed."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hdril.benchmark.engine import Engine, Progress, in_order
+from hdril.benchmark.steps import Step
+from hdril.benchmark.store import Store
+from hdril.errors import UserError
+from tests.benchmark.made_up import Words
+
+
+@pytest.fixture
+def count(tmp_path: Path) -> Path:
+    return tmp_path / "count"
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store")
+
+
+def diamond(count: Path, pause: float = 0.0) -> Words:
+    """``top`` is made from ``left`` and ``right``, and both from ``bottom``."""
+    bottom = Words("bottom", count, pause=pause)
+    sides = tuple(Words(side, count, (bottom,), pause) for side in ("left", "right"))
+    return Words("top", count, sides, pause)
+
+
+def begun(count: Path) -> Counter[str]:
+    return Counter(count.read_text().split()) if count.exists() else Counter()
+
+
+def text_of(store: Store, step: Step) -> str:
+    return (store.get(step).output / "text").read_text()
+
+
+def test_steps_come_after_their_inputs_and_once(count: Path) -> None:
+    top = diamond(count)
+    titles = [step.title for step in in_order([top, top.made_from[1]])]
+    assert titles == ["bottom", "left", "right", "top"]
+
+
+def test_all_is_done_once_and_told(store: Store, count: Path) -> None:
+    told: list[tuple[str, bool, float | None]] = []
+
+    def watch(step: Step, progress: Progress) -> None:
+        told.append((step.title, progress.fresh, progress.remaining()))
+
+    top = diamond(count)
+    Engine(store, 2, watch).run([top])
+    assert text_of(store, top) == "(top (left (bottom)) (right (bottom)))"
+    assert begun(count) == dict.fromkeys(("bottom", "left", "right", "top"), 1)
+    assert {title for title, fresh, _ in told if fresh} == {"bottom", "left", "right", "top"}
+    assert told[-1][2] == 0.0
+    told.clear()
+    Engine(Store(store.folder), 2, watch).run([top])
+    assert sum(begun(count).values()) == 4, "nothing was done again"
+    assert [fresh for _, fresh, _ in told] == [False] * 4
+
+
+def test_what_changed_is_done_anew_and_only_that(store: Store, count: Path) -> None:
+    top = diamond(count)
+    Engine(store, 2).run([top])
+    left, right = top.made_from
+    other = replace(top, made_from=(replace(left, text="links"), right))
+    Engine(store, 2).run([other])
+    assert begun(count) == {"bottom": 1, "left": 1, "right": 1, "top": 2, "links": 1}
+    assert text_of(store, other) == "(top (links (bottom)) (right (bottom)))"
+    Engine(store, 2).run([top])
+    assert begun(count)["top"] == 2, "the first result is still there"
+
+
+def test_an_input_that_became_another_makes_what_depends_on_it_another(store: Store, count: Path) -> None:
+    """By content: the result of an input, and not its options, decides whether a step is done anew."""
+    top = diamond(count)
+    Engine(store, 2).run([top])
+    place = store.place(top.made_from[0])
+    assert place is not None
+    (place / "step.json").unlink()
+    Engine(Store(store.folder), 2).run([top])
+    assert begun(count) == {"bottom": 1, "left": 2, "right": 1, "top": 1}, "it gave the same, so top stands"
+
+
+def test_a_step_that_fails_keeps_back_what_is_made_from_it_alone(store: Store, count: Path) -> None:
+    broken = Words("broken", count)
+    after, apart = Words("after", count, (broken,)), Words("apart", count)
+    with pytest.raises(UserError, match=r"a step failed: broken: see .*/words/\w+/log\.txt") as error:
+        Engine(store, 2).run([after, apart])
+    assert store.find(apart) is not None
+    assert store.find(after) is None
+    assert begun(count) == {"broken": 1, "apart": 1}
+    log = Path(str(error.value).partition("see ")[2].partition(" (")[0])
+    assert "this step cannot be done" in log.read_text()
+
+
+def test_as_many_at_a_time_as_allowed(store: Store, count: Path) -> None:
+    """Six steps of half a second, three at a time: faster than one after the other, and never more than three."""
+    steps = [Words(f"step{i}", count, pause=0.5) for i in range(6)]
+    most = 0
+
+    def watch(step: Step, progress: Progress) -> None:
+        nonlocal most
+        most = max(most, sum(begun(count).values()) - 6 + progress.left["words"] + 1)
+
+    Engine(store, 3, watch).run(steps)
+    assert 1 < most <= 3 + 1  # a step is told of a moment after it is done, when the next one may have begun
+
+
+ENGINE = """
+import sys
+from pathlib import Path
+from hdril.benchmark.engine import Engine
+from hdril.benchmark.store import Store
+from tests.benchmark.test_engine import diamond
+Engine(Store(Path(sys.argv[1])), 2).run([diamond(Path(sys.argv[2]), float(sys.argv[3]))])
+"""
+
+
+def start(store: Store, count: Path, pause: float) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-c", ENGINE, str(store.folder), str(count), str(pause)]
+    return subprocess.Popen(command, start_new_session=True)
+
+
+def test_killed_again_and_again_it_ends_with_the_same_and_repeats_nothing(store: Store, count: Path) -> None:
+    random.seed(7)
+    for _ in range(5):
+        process = start(store, count, 0.6)
+        begins, until = sum(begun(count).values()), time.monotonic() + 60
+        while process.poll() is None and sum(begun(count).values()) == begins and time.monotonic() < until:
+            time.sleep(0.02)  # until a step has begun
+        time.sleep(random.uniform(0.0, 0.8))
+        os.kill(process.pid, signal.SIGKILL)  # the process alone: what it started must notice
+        process.wait()
+    fresh = Store(store.folder)
+    done = [step.title for step in in_order([diamond(count)]) if fresh.find(step)]
+    before = begun(count)
+    assert start(store, count, 0.0).wait(timeout=120) == 0
+    top = diamond(count)
+    assert text_of(store, top) == "(top (left (bottom)) (right (bottom)))"
+    assert all(begun(count)[title] == before[title] for title in done), "what was done is not done again"
+    assert not list(store.folder.rglob("*.tmp"))
+
+
+def test_two_engines_share_the_work(store: Store, count: Path) -> None:
+    first, second = start(store, count, 0.5), start(store, count, 0.5)
+    assert (first.wait(timeout=120), second.wait(timeout=120)) == (0, 0)
+    assert begun(count) == dict.fromkeys(("bottom", "left", "right", "top"), 1)
