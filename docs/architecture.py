@@ -14,7 +14,7 @@ PICTURE = ROOT / "docs/images/architecture.svg"
 
 FLOORS = (
     ("cli", "lerobot_env"),
-    ("hub", "viewer"),
+    ("benchmark", "hub", "viewer"),
     ("evaluation",),
     ("demonstrations",),
     ("rollout",),
@@ -71,7 +71,7 @@ def reduce(pairs: set[tuple[str, str]]) -> set[tuple[str, str]]:
 
 def _places() -> dict[str, tuple[float, float]]:
     """Centre of each box, pixels."""
-    column = {1: (210.0,), 2: (110.0, 310.0)}
+    column = {1: (250.0,), 2: (150.0, 350.0), 3: (85.0, 250.0, 415.0)}
     places = {
         name: (x, TOP + BOX[1] / 2 + row * HEIGHT)
         for row, floor in enumerate(FLOORS)

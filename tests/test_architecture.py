@@ -27,8 +27,9 @@ BELOW: dict[str, set[str]] = {name: set() for name in BOTTOM} | {
     "evaluation": {"trace", "demonstrations"},
     "viewer": {"evaluation"},
     "hub": {"evaluation"},
+    "benchmark": {"evaluation"},
     "lerobot_env": {"viewer"},
-    "cli": {"viewer", "hub", "lerobot_env"},
+    "cli": {"viewer", "hub", "benchmark", "lerobot_env"},
 }
 """What each room may import, with everything below that. ``hdril/__init__.py`` may import tasks, to register them."""
 

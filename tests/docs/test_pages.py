@@ -16,6 +16,7 @@ import yaml
 
 import hdril
 from hdril.cli.bench import BenchConfig
+from hdril.cli.benchmark import BenchmarkConfig
 from hdril.cli.check import CheckConfig
 from hdril.cli.eval import EvalConfig
 from hdril.cli.labels import LabelsConfig
@@ -35,6 +36,7 @@ COMMANDS = {
     "hdril-eval": EvalConfig,
     "hdril-view": ViewConfig,
     "hdril-bench": BenchConfig,
+    "hdril-benchmark": BenchmarkConfig,
 }
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 

@@ -1,0 +1,282 @@
+"""The matrix: its steps, its checks, what was found in it, and the report. Nothing is trained."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import draccus
+import numpy as np
+import pytest
+
+from hdril.benchmark.engine import in_order
+from hdril.benchmark.matrix import Matrix, check, rows, steps
+from hdril.benchmark.report import markdown
+from hdril.benchmark.results import collect
+from hdril.benchmark.steps import Evaluate, Step
+from hdril.benchmark.store import Store
+from hdril.cli.benchmark import BenchmarkConfig, benchmark_command
+from hdril.digest import digest_json
+from hdril.evaluation.results import Run, summarise
+from tests.evaluation.synthetic import outcome
+
+ROOT = Path(__file__).parents[2]
+SEED, COUNT = 600_000, 8
+VALUES: dict[str, Any] = {
+    "name": "test",
+    "data": {
+        "nominal": {"task": "table_lift", "episodes": 50},
+        "varied": {"task": "table_lift:level=varied", "episodes": 50},
+    },
+    "policies": {
+        "linear": {"steps": 10, "options": ["--policy.preset=linear"]},
+        "act": {"steps": 30, "options": ["--policy.type=act"]},
+        "hdril": {"steps": 20},
+    },
+    "evaluations": {
+        "nominal": {"task": "table_lift", "episodes": COUNT, "seed": SEED},
+        "varied": {"task": "table_lift:level=varied", "episodes": COUNT, "seed": SEED},
+    },
+    "tables": [
+        {
+            "title": "Lift", "data": ["nominal", "varied"], "policies": ["linear", "act", "hdril"],
+            "evaluations": ["nominal", "varied"], "training_seeds": [1, 2], "demonstrations": [10, 50], "against": "hdril",
+            "note": "A note.",
+        }
+    ],
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def in_the_root(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Config files are named from there."""
+    monkeypatch.chdir(ROOT)
+
+
+def changed(change: Callable[[dict[str, Any]], object] = lambda values: None) -> Matrix:
+    values = copy.deepcopy(VALUES)
+    change(values)
+    return draccus.decode(Matrix, values)
+
+
+def test_each_step_is_there_once() -> None:
+    matrix = changed()
+    kinds = [step.kind for step in in_order(steps(matrix))]
+    assert {kind: kinds.count(kind) for kind in kinds} == {"record": 2, "train": 24, "evaluate": 48}
+    (table,) = matrix.tables
+    assert [(row.data, row.demonstrations, row.policy) for row in rows(matrix, table)][:4] == [
+        ("nominal", 10, "linear"), ("nominal", 10, "act"), ("nominal", 10, "hdril"), ("nominal", 50, "linear"),
+    ]  # fmt: skip
+    again = changed(lambda values: values["tables"].append(values["tables"][0] | {"title": "Again"}))
+    assert len(in_order(steps(again))) == len(kinds), "two tables share what is the same"
+
+
+def test_commands_say_what_is_done() -> None:
+    evaluate = next(step for step in steps(changed()) if step.policy.name == "linear" and step.name == "varied")
+    train, out = evaluate.policy, Path("out")
+    assert train.command(out, {"data": Path("set")}) == [
+        "lerobot-train", "--config_path=configs/train/table_lift.yaml", "--dataset.repo_id=local/benchmark", "--dataset.root=set",
+        f"--dataset.episodes={list(range(10))}", "--output_dir=out", "--steps=10", "--save_freq=10", "--seed=1",
+        "--policy.preset=linear",
+    ]  # fmt: skip
+    assert evaluate.command(out, {"policy": Path("run")}) == [
+        "hdril-eval", "--policy.path=run/checkpoints/000010/pretrained_model", "--task=table_lift:level=varied",
+        f"--num_episodes={COUNT}", f"--seed={SEED}", "--rerun=none", "--workers=1", "--output_dir=out",
+    ]  # fmt: skip
+
+
+def test_what_decides_a_result_is_in_its_settings_and_nothing_else(tmp_path: Path) -> None:
+    evaluate = steps(changed())[0]
+    train, record = evaluate.policy, evaluate.policy.data
+
+    def same(step: Step, **changes: Any) -> bool:
+        return digest_json(replace(step, **changes).settings()) == digest_json(step.settings())  # pyright: ignore[reportArgumentType]
+
+    assert same(train, name="another name")
+    assert same(evaluate, name="another name")
+    for changes in ({"steps": 11}, {"seed": 3}, {"episodes": 11}, {"options": ("--policy.preset=hdril",)}):
+        assert not same(train, **changes), changes
+    assert not same(evaluate, options=("--policy.rollout=open_loop",))
+    assert not same(record, perturb=0.001)
+    assert not same(record, events="push=1")
+    config = tmp_path / "train.yaml"
+    config.write_text(train.config.read_text())
+    assert same(train, config=config), "a config file counts by its content"
+    config.write_text(config.read_text().replace("batch_size: 64", "batch_size: 32"))
+    assert not same(train, config=config)
+
+
+def test_a_change_of_hdril_does_not_touch_what_it_does_not_make(monkeypatch: pytest.MonkeyPatch) -> None:
+    """ACT is trained again for a change of LeRobot, not for one of HDR-IL."""
+    by_name = {step.policy.name: step.policy for step in steps(changed())}
+    before = {name: digest_json(step.settings()) for name, step in by_name.items()}
+    monkeypatch.setattr("hdril.benchmark.steps.package_software", lambda package: {package: "another source"})
+    after = {name: digest_json(step.settings()) for name, step in by_name.items()}
+    assert {name for name in before if before[name] != after[name]} == {"linear", "hdril"}
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda v: v["tables"][0].update(policies=["gru"]), "policies has no 'gru'; choose from: linear, act, hdril"),
+        (lambda v: v["tables"][0].update(against="gru"), "against has no 'gru'; choose from: linear, act, hdril"),
+        (lambda v: v["tables"][0].update(evaluations=[]), "names no evaluations; choose from: nominal, varied"),
+        (lambda v: v["tables"][0].update(training_seeds=[]), "names no training_seeds"),
+        (lambda v: v["tables"][0].update(demonstrations=[51]), "data nominal has 1 to 50 demonstrations, got 51"),
+        (lambda v: v["policies"]["act"].update(steps=0), "policy act: steps must be at least 1, got 0"),
+        (lambda v: v["data"]["nominal"].update(task="juggle"), "juggle"),
+        (lambda v: v["evaluations"]["nominal"].update(episodes=0), "evaluation nominal: episodes must be at least 1, got 0"),
+        (lambda v: v["evaluations"]["nominal"].update(seed=2**31), "evaluation nominal: seed must be from 0 to"),
+        (lambda v: v["evaluations"]["nominal"].update(task="peg_in_hole"), "evaluation nominal is not of table_lift"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused_in_one_line(change: Callable[[dict[str, Any]], object], words: str) -> None:
+    check(changed())
+    with pytest.raises(ValueError, match=words) as error:
+        check(changed(change))
+    assert "\n" not in str(error.value)
+
+
+def test_seeds_that_were_trained_or_tuned_on_are_refused() -> None:
+    """The scenes of a seed are alike at every level, so that other parameters of the task do not make it another seed."""
+    with pytest.raises(ValueError, match=r"evaluation varied is not held out: data nominal has its seeds 60 to 67"):
+        check(changed(lambda values: values["evaluations"]["varied"].update(seed=60)))
+    tuning = {"task": "table_lift", "episodes": 10, "seed": SEED + 7, "tuning": True}
+    with pytest.raises(
+        ValueError, match=rf"evaluation nominal is not held out: tuning on choice has its seeds {SEED + 7} to"
+    ):
+        check(changed(lambda values: values["evaluations"].update(choice=tuning)))
+
+    def report(values: dict[str, Any]) -> None:
+        values["evaluations"]["choice"] = tuning | {"seed": SEED + 100}
+        values["tables"][0]["evaluations"] = ["choice"]
+
+    with pytest.raises(ValueError, match="choice is for tuning, and is not reported"):
+        check(changed(report))
+    peg = {"task": "peg_in_hole", "episodes": 50, "seed": SEED}
+    check(changed(lambda values: values["data"].update(peg=peg)))  # seeds of another task
+
+
+def test_there_must_be_a_config_file() -> None:
+    with pytest.raises(FileNotFoundError, match=r"policy act: there is no config file nowhere\.yaml"):
+        check(changed(lambda values: values["policies"]["act"].update(config="nowhere.yaml")))
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "configs/benchmark").glob("*.yaml")), ids=lambda file: file.stem)
+def test_the_benchmarks_of_this_repository_can_be(file: Path) -> None:
+    config = draccus.parse(BenchmarkConfig, args=[f"--config_path={file}"])
+    check(config)
+    assert config.name == file.stem
+    assert steps(config)
+
+
+# ---------------------------------------------------------------- what was found
+
+
+def pretend(store: Store, matrix: Matrix, failed: Callable[[Evaluate], set[int]]) -> None:
+    """Fill a store as if all had been done: ``failed`` seeds by evaluation."""
+    for step in in_order(steps(matrix)):
+        place = store.place(step)
+        assert place is not None
+        (place / "result").mkdir(parents=True)
+        command = " ".join(step.command(place / "result", store.input_folders(step)))
+        done = {"digest": digest_json(step.title), "seconds": 90.0, "command": command}
+        (place / "step.json").write_text(json.dumps(done))
+        if isinstance(step, Evaluate):
+            seeds = range(step.first_seed, step.first_seed + step.episodes)
+            outcomes = [replace(outcome(seed), success=seed not in failed(step)) for seed in seeds]
+            run = Run(step.task, "policy", (), step.first_seed, step.episodes, True, "compared")
+            results = summarise(run, outcomes) | {"identity": {"policy": {"weights": digest_json(step.policy.title)}}}
+            (place / "result/results.json").write_text(json.dumps(results))
+
+
+def fails(step: Evaluate) -> set[int]:
+    """The linear maps fail on all seeds of one training and on two of the other, ACT on one, HDR-IL on none."""
+    if step.policy.name == "linear":
+        return set(range(SEED, SEED + (COUNT if step.policy.seed == 1 else 2)))
+    return {SEED} if step.policy.name == "act" else set()
+
+
+def one_row(values: dict[str, Any]) -> None:
+    values["tables"][0].update(data=["varied"], demonstrations=[], evaluations=["varied"])
+
+
+def test_numbers_and_tests_of_a_table(tmp_path: Path) -> None:
+    matrix, store = changed(one_row), Store(tmp_path / "store")
+    with pytest.raises(KeyError):
+        collect(matrix, store)
+    pretend(store, matrix, fails)
+    (table,) = collect(matrix, store)["tables"]
+    by_name = {row["policy"]: row for row in table["rows"]}
+    assert [run["n_success"] for run in by_name["linear"]["cells"]["varied"]] == [0, 6]
+    assert [run["training_seed"] for run in by_name["linear"]["cells"]["varied"]] == [1, 2]
+    assert by_name["act"]["training_minutes"] == [1.5, 1.5]
+    linear, act = table["tests"]
+    assert (linear["policy"], linear["evaluation"], act["policy"]) == ("linear", "varied", "act")
+    assert linear["pc_difference"] == pytest.approx(-62.5)
+    assert linear["p_values"] == pytest.approx([2 * 0.5**8, 0.5])
+    assert act["p_values"] == [1.0, 1.0]
+    assert linear["p_values_holm"] == pytest.approx([4 * 2 * 0.5**8, 1.0])
+    low, high = linear["pc_difference_ci95"]
+    assert -100.0 <= low < -62.5 < high <= 0.0
+    assert str(tmp_path) not in json.dumps(table), "no path of this machine"
+
+
+def test_the_report_says_what_was_found(tmp_path: Path) -> None:
+    matrix, store = changed(one_row), Store(tmp_path / "store")
+    pretend(store, matrix, fails)
+    text = markdown(collect(matrix, store))
+    assert "## Lift\n\nA note." in text
+    assert (
+        "| `linear` | varied       | 50               | 1.5 to 1.5            | 2 × 8: 37.5 % (0.0 to 75.0, SD 53.0)"
+        in text
+    )
+    assert "`varied`: `table_lift:level=varied`, 8 seeds from 600000 on. Training seeds: 1, 2." in text
+    assert "adjusted by Holm's method for the 4 tests of the table" in text
+    assert "not shown" in text
+    assert "hdril-eval --policy.path=STORE/train/" in text
+    single = changed(lambda values: (one_row(values), values["tables"][0].update(training_seeds=[2], against="")))
+    text = markdown(collect(single, store))
+    assert "| 6 of 8: 75.0 (40.9 to 92.9) " in text
+    assert "Against" not in text
+
+
+def test_the_command_plans_and_reports_without_doing_what_is_done(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    matrix = changed(one_row)
+    config = BenchmarkConfig(**vars(matrix), store=tmp_path / "store", document=tmp_path / "report", plan=True)
+    benchmark_command(config)
+    told = capsys.readouterr().out
+    assert "left  record    50 demonstrations of table_lift:level=varied" in told
+    assert "0 of 13 steps are done" in told
+    assert not (tmp_path / "store").exists()
+    pretend(Store(tmp_path / "store"), matrix, fails)
+    monkeypatch.setattr("hdril.benchmark.engine.start", None)  # doing a step would fail
+    benchmark_command(replace(config, plan=False))
+    assert json.loads((tmp_path / "report.json").read_text())["name"] == "test"
+    assert (tmp_path / "report.md").read_text().startswith("# Benchmark: test\n")
+    with pytest.raises(ValueError, match="jobs must be at least 1, got 0"):
+        benchmark_command(replace(config, jobs=0))
+
+
+def test_outcomes_of_one_policy_do_not_differ_from_themselves(tmp_path: Path) -> None:
+    from hdril.evaluation.statistics import bootstrap_difference
+
+    same = np.random.default_rng(3).random((1, 50)) < 0.6
+    assert bootstrap_difference(same, same) == (0.0, 0.0)
+    better = np.ones((3, 200), np.bool_)
+    worse = np.tile(np.arange(200) % 4 > 0, (3, 1))
+    low, high = bootstrap_difference(better, worse)
+    assert 0.18 < low < 0.25 < high < 0.32, "a quarter of the seeds, give or take two standard errors of 0.03"
+    assert bootstrap_difference(worse, better) == pytest.approx((-high, -low), abs=0.01)
+    # Trainings that differ make the interval wider than seeds alone do.
+    uneven = np.concatenate([np.ones((1, 200), np.bool_), np.zeros((1, 200), np.bool_)])
+    wide = bootstrap_difference(uneven, worse[:1])
+    assert wide[1] - wide[0] > 0.9
+    with pytest.raises(ValueError, match=r"the same seeds, got \(3, 200\) and \(1, 50\)"):
+        bootstrap_difference(better, same)
