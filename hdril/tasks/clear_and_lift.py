@@ -22,7 +22,7 @@ from hdril.simulation.robots.spec import OTHER, SIGN
 from hdril.simulation.world import ROBOT, World
 from hdril.tasks import table_lift
 from hdril.tasks.bench import BENCH
-from hdril.tasks.conditions import Condition, Stage, raised
+from hdril.tasks.conditions import Condition, Stage
 from hdril.tasks.factors import Factor
 from hdril.tasks.primitives import Hands, Need, Primitive, Scene, Segment
 from hdril.tasks.table_lift import DEPTH, PLATFORM_DEPTH, PLATFORM_HEIGHT, PLATFORM_X, TOP, WIDTH
@@ -331,7 +331,7 @@ def make_scene(values: Values) -> Task:
         length=lift.horizon,
         longest=lift.horizon + PICK_AND_PUT,
         success=(*lift.success, BOX_ASIDE, BOX_LEFT),
-        stages=(Stage("box aside", (BOX_ASIDE,)), Stage("table raised", (raised("table", 0.05),))),
+        stages=(Stage("box aside", (BOX_ASIDE,)), *lift.stages),
         factors=(*lift.factors, *FACTORS),
         vary=make_scene,
         admissible=admissible,

@@ -18,7 +18,7 @@ from hdril.simulation.bodies import BodySpec, Box
 from hdril.simulation.robots.spec import SIDES, SIGN
 from hdril.simulation.world import ROBOT
 from hdril.tasks.bench import ARM_JOINTS, BENCH, BENCH_PLACEMENT
-from hdril.tasks.conditions import at_height, at_rest, not_touching, touching, upright
+from hdril.tasks.conditions import Stage, at_height, at_rest, not_touching, raised, touching, upright
 from hdril.tasks.events import EventSpec
 from hdril.tasks.factors import Factor
 from hdril.tasks.primitives import (
@@ -291,6 +291,10 @@ def make_scene(values: Values) -> Task:
             not_touching("table", ROBOT),
         ),
         dwell=9,
+        stages=(
+            Stage("table raised", (raised("table", 0.05),)),
+            Stage("table on the platform", (at_height("table", height), touching("table", "platform"))),
+        ),
         factors=FACTORS,
         events=EVENTS,
         vary=make_scene,

@@ -203,9 +203,17 @@ def test_failures_are_listed_by_reason_and_by_seed() -> None:
     text = report(nine_of_ten())
     assert "did not hold: table upright (1), table at rest (1)." in text
     assert "more than 2 cm from the expert's: lift (1)." in text
-    assert "The last stage" not in text, "table lift has no stages"
+    assert "The last stage that was reached: none (1)." in text
     assert rows(text, "seed") == [["12", "table upright, table at rest", "none", "lift", "3.00", "4", "succeeds"]]
     assert "## Failures" not in report([outcome(0)])
+
+
+def test_a_task_without_stages_has_no_word_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = replace(get_task("table_lift"), stages=())
+    monkeypatch.setattr("hdril.evaluation.report.get_task", lambda name: plain)
+    text = report(nine_of_ten())
+    assert "## Failures" in text
+    assert "The last stage" not in text
 
 
 def test_reasons_are_in_the_order_of_their_number_and_stages_in_that_of_the_task() -> None:

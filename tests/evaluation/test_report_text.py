@@ -52,7 +52,7 @@ def write(folder: Path) -> dict[str, Any]:
 
 
 def write_lift(folder: Path) -> dict[str, Any]:
-    """One of a task without stages, by a policy with a planner, with a failure on the expert's path."""
+    """One of table lift, by a policy with a planner, with a failure on the expert's path."""
     run = replace(RUN, task="table_lift", num_episodes=3, overrides=(), held_out=None, held_out_basis="", notes=())
     failed = outcome(9, success=False, unmet="table at rest", stage="")
     return write_report(folder, replace(run, max_frames=0), [outcome(7), outcome(8), failed])

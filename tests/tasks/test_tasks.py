@@ -14,6 +14,7 @@ from gymnasium.utils.env_checker import check_env
 
 from hdril.env import BimanualEnv
 from hdril.geometry import Pose
+from hdril.rollout import transitions
 from hdril.simulation.actions import hand_poses, hand_slice, openings
 from hdril.simulation.kinematics import Chain
 from hdril.simulation.robots import SIDES
@@ -58,6 +59,17 @@ def test_expert_succeeds(env: BimanualEnv) -> None:
         assert info["is_success"], (seed, info)
         longest = env.task_spec.horizon if env.task_spec.longest is None else env.task_spec.budget
         assert env.task_spec.horizon <= env.frame <= longest
+
+
+def test_the_expert_reaches_the_stages_one_after_the_other(env: BimanualEnv) -> None:
+    """A stage that never fails to hold, or that the expert never reaches, would tell nothing of a failure."""
+    expert = ScriptedExpert(env.task_spec)
+    reached = [transition.info["stage"] for transition in transitions(env, expert, 900_004)]
+    assert reached == sorted(reached)
+    assert reached[-1] == len(env.task_spec.stages) + 1, "success comes after the last one"
+    assert env.task_spec.stages
+    assert reached[0] < len(env.task_spec.stages)
+    assert set(range(reached[0], reached[-1] + 1)) == set(reached)
 
 
 @pytest.mark.long
