@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -103,3 +105,14 @@ def test_the_policy_imports_nothing_of_hdril_or_pybullet(file: Path) -> None:
 def test_hdril_knows_little_of_the_policy(room: str, file: Path) -> None:
     used = {name for name in imports(file) if name.startswith("lerobot_policy_hdril")}
     assert used <= OF_THE_POLICY.get(room, set())
+
+
+SLOW = ("torch", "lerobot", "pandas", "statsmodels", "matplotlib", "rerun", "datatrove")
+"""Libraries that take long to import: a command waits for those that it needs, and says what is wrong before that."""
+
+
+@pytest.mark.parametrize("command", ["record", "check", "labels", "eval", "benchmark", "bench"])
+def test_a_command_starts_without_what_it_may_not_need(command: str) -> None:
+    program = f"import sys, hdril.cli.{command}; print(*sorted({{name.partition('.')[0] for name in sys.modules}}))"
+    loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert not set(SLOW) & set(loaded)

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from hdril.demonstrations.content import CONTENT, Columns
 from hdril.demonstrations.schema import ACTION, ENVIRONMENT_STATE, STATE, SUBTASK
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 VECTORS = (STATE, ENVIRONMENT_STATE, ACTION)
 PLACES = ("episode_index", "frame_index", "index", "timestamp")
@@ -54,6 +56,7 @@ def read_rows(root: Path) -> dict[int, dict[str, Any]]:
     Raises:
         ValueError: it cannot be read; says why.
     """
+    import pandas as pd
     import pyarrow as arrow
 
     files = sorted((root / "meta/episodes").rglob("*.parquet"))

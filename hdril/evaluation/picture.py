@@ -4,28 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib
-
-matplotlib.use("agg")
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
 
 from hdril.evaluation.results import headline
 from hdril.evaluation.score import Outcome
 from hdril.tasks import get_task
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 def draw(path: Path, outcomes: Sequence[Outcome], summary: Mapping[str, Any]) -> None:
     """Write the picture of an evaluation whose data are ``summary``."""
-    figure, (area, bars) = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    from matplotlib.figure import Figure  # here, because each worker process imports this module
+
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    area, bars = figure.subplots(1, 2)
     _draw_starts(area, outcomes, get_task(summary["task"]).observed)
     _draw_errors(bars, summary["position_error_cm_by_primitive"])
     figure.suptitle(f"{summary['task']}: {headline(summary)}", fontsize=10)
     figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 def _draw_starts(axes: Axes, outcomes: Sequence[Outcome], names: tuple[str, ...]) -> None:

@@ -9,9 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from statsmodels.stats.contingency_tables import mcnemar
-from statsmodels.stats.multitest import multipletests
-from statsmodels.stats.proportion import proportion_confint
 
 
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -22,6 +19,8 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
     """
     if trials < 1 or not 0 <= successes <= trials:
         raise ValueError(f"an interval needs 0 <= successes <= trials and a trial, got {successes} of {trials}")
+    from statsmodels.stats.proportion import proportion_confint  # here: it takes a second to import
+
     interval = proportion_confint(successes, trials, alpha=1.0 - confidence, method="wilson")
     low, high = np.asarray(interval, dtype=np.float64).tolist()
     return low, high
@@ -91,6 +90,8 @@ def mcnemar_exact(counts: PairedCounts) -> float:
     With b and c the discordant counts, p = min(1, 2 P(X <= min(b, c))) for X ~ Binomial(b + c, 1/2). McNemar (1947), "Note
     on the sampling error of the difference between correlated proportions or percentages", in its exact form.
     """
+    from statsmodels.stats.contingency_tables import mcnemar
+
     result: Any = mcnemar([[counts.both, counts.first_only], [counts.second_only, counts.neither]], exact=True)
     return float(result.pvalue)
 
@@ -165,6 +166,8 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
     Holm (1979), "A simple sequentially rejective multiple test procedure".
     """
+    from statsmodels.stats.multitest import multipletests
+
     return np.asarray(multipletests(p_values, method="holm")[1]).tolist() if p_values else []
 
 

@@ -7,11 +7,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("agg")
-import matplotlib.pyplot as plt
-
 from hdril.markdown import table
 
 PICTURE = "suite.png"
@@ -111,7 +106,10 @@ def draw_suite(path: Path, data: Mapping[str, Any]) -> None:
     """Success of each row with its interval; a ring for the control of a row with events."""
     rows = data["rows"]
     controls = {row["cell"]: row["pc_success"] for row in data["controls"]}
-    figure, axes = plt.subplots(figsize=(8, 1.2 + 0.28 * len(rows)), layout="constrained")
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 1.2 + 0.28 * len(rows)), layout="constrained")
+    axes = figure.subplots()
     for height, row in enumerate(rows):
         low, high = row["pc_success_ci95"]
         rate, colour = row["pc_success"], _COLOURS[row["kind"]]
@@ -129,4 +127,3 @@ def draw_suite(path: Path, data: Mapping[str, Any]) -> None:
     axes.invert_yaxis()
     axes.set_title(f"{data['task']}: {data['policy']}", fontsize=10)
     figure.savefig(path, dpi=110)
-    plt.close(figure)

@@ -6,14 +6,10 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 
-import rerun as rr
-
 from hdril.digest import SHORT
 from hdril.evaluation.evaluate import EvaluatedEpisode
 from hdril.evaluation.score import Outcome
-from hdril.viewer.blueprint import blueprint
 from hdril.viewer.keep import keeps
-from hdril.viewer.log import EpisodeLog
 
 APPLICATION = "hdril"
 
@@ -51,6 +47,11 @@ def write_episodes(path: Path, name: str, episodes: dict[str, EvaluatedEpisode])
     ``episodes`` are by the name of the player, with which its entities begin; a single one may have the name "". The worlds
     of their environments must still be open. The recording's properties say what played them, as JSON.
     """
+    import rerun as rr  # here: whoever keeps no recording need not wait for it
+
+    from hdril.viewer.blueprint import blueprint
+    from hdril.viewer.log import EpisodeLog
+
     path.parent.mkdir(parents=True, exist_ok=True)
     env = next(iter(episodes.values())).env
     # The viewer takes recordings of the same id for parts of one: the same seed, played by other weights, is another one.
