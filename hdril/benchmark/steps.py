@@ -128,7 +128,7 @@ class Train(Step):
     def settings(self) -> dict[str, Any]:
         config = {"config": digest_file(self.config), "options": list(self.options), "steps": self.steps}
         software = {name: distribution_version(name) for name in ("lerobot", "torch", "numpy")}
-        if self.policy_type == "hdril":
+        if self.policy_type in ("hdril", "nearest"):
             software |= package_software("lerobot_policy_hdril")
         return config | {"episodes": self.episodes, "seed": self.seed, "software": software}
 

@@ -60,6 +60,14 @@ class History:
     mask: Tensor
 
 
+@dataclass(frozen=True)
+class Replay:
+    """Whole episodes: their first states (E, S), and their actions (E, T, A), the last one repeated to the end."""
+
+    state: Tensor
+    action: Tensor
+
+
 def read_primitives(root: Path) -> list[str]:
     """Names of the primitives in the order of their labels.
 
@@ -214,6 +222,17 @@ class Demonstrations:
     def _bounds(starts: np.ndarray, device: str) -> Tensor:
         first = np.flatnonzero(starts)
         return torch.from_numpy(np.stack([first, np.append(first[1:], len(starts))], axis=1)).to(device)
+
+    @property
+    def longest_episode(self) -> int:
+        """Frames of the longest episode."""
+        return int((self._episode_bounds[:, 1] - self._episode_bounds[:, 0]).max())
+
+    def episodes(self, chosen: Tensor, length: int) -> Replay:
+        """Episodes (E,), counted from 0, in ``length`` frames."""
+        first, end = self._episode_bounds[chosen].unbind(-1)
+        steps = first[:, None] + torch.arange(length, device=first.device)
+        return Replay(self.state[first], self.action[torch.minimum(steps, end[:, None] - 1)])
 
     def lengths(self, episodes: Tensor) -> list[list[int]]:
         """Shortest and longest run of each primitive in these episodes, frames; [0, 0] for one that is not among them."""
