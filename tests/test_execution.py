@@ -10,12 +10,14 @@ from pathlib import Path
 
 import pytest
 
+from hdril.cli.record import RecordConfig, record_command
 from hdril.demonstrations.episode import demonstrate
 from hdril.demonstrations.provenance import Provenance, Recipe, read_provenance
 from hdril.demonstrations.record import partial_folder, record, record_shard
 from hdril.demonstrations.shards import Shards
 from hdril.errors import UserError
 from hdril.execution import SlurmConfig, check_execution, run_on_ray, share
+from tests.fake_slurm import FakeSlurm
 
 COUNT = 5
 RECIPE = Recipe("table_lift")
@@ -114,7 +116,40 @@ def test_a_shard_that_is_late_says_so(made_up, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-# --------------------------------------------------------------------- real clusters
+# --------------------------------------------------------------------- clusters
+
+
+def test_slurm_is_asked_for_shards_and_for_a_last_job_that_plays_what_they_left(
+    alone: Provenance, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A Slurm that keeps what is submitted: the first shard is played, the second one is lost."""
+    slurm, root = FakeSlurm(tmp_path / "slurm", monkeypatch), tmp_path / "set"
+    record_command(
+        RecordConfig(num_episodes=COUNT, seed=50, root=root, shards=2, workers=1, executor="slurm",
+                     slurm=SlurmConfig("cpu", "00:10:00", 3, qos="low", account="lab"))
+    )  # fmt: skip
+    told = capsys.readouterr().out
+    shards, finish = (job for job in slurm.jobs if "launch_pickled_pipeline" in job.script)
+    assert shards.options.items() >= {
+        "partition": "cpu", "time": "00:10:00", "mem-per-cpu": "3G", "qos": "low", "account": "lab", "array": "0-1%1",
+        "job-name": "hdril_record_shards",
+    }.items()  # fmt: skip
+    assert "--dependency" not in shards.arguments
+    assert "--dependency=afterany:100" in finish.arguments, "also after shards that failed"
+    assert "Submitted 2 shards as job 100; job " in told
+    assert not root.exists()
+    shards.run(only=0)
+    assert sorted(path.name for path in partial_folder(root).glob("*.npz")) == ["50.npz", "51.npz"]
+    finish.run()
+    assert read_provenance(root) == alone
+
+
+def test_a_slurm_that_refuses_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    slurm = FakeSlurm(tmp_path / "slurm", monkeypatch)
+    slurm.program.write_text("#!/bin/sh\nexit 3\n")
+    config = RecordConfig(num_episodes=1, root=tmp_path / "set", executor="slurm", slurm=SlurmConfig("cpu"))
+    with pytest.raises(UserError, match=r"Slurm refused the jobs: .*exit status 3"):
+        record_command(config)
 
 
 def _record(root: Path, *options: str) -> str:

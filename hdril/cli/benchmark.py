@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from tqdm import tqdm
@@ -17,6 +18,8 @@ from hdril.benchmark.results import collect
 from hdril.benchmark.steps import Step
 from hdril.benchmark.store import Store
 from hdril.cli.common import run
+from hdril.cli.shards import log_folder
+from hdril.execution import SlurmConfig, check_execution, submit_to_slurm
 from hdril.files import write_atomically
 
 
@@ -36,6 +39,13 @@ class BenchmarkConfig(Matrix):
     """Steps at a time; each has one thread."""
     plan: bool = False
     """Do nothing: print what is done and what is left."""
+    executor: str = "local"
+    """Who does the steps: local, this machine; slurm, jobs of a Slurm cluster, and this command ends when they are submitted.
+    The disk must be shared."""
+    shards: int = 1
+    """Jobs of --executor=slurm, each of which does one step after the other; a last one reports."""
+    slurm: SlurmConfig = field(default_factory=SlurmConfig)
+    """What these jobs may take."""
 
 
 def benchmark_command(config: BenchmarkConfig) -> None:
@@ -43,9 +53,15 @@ def benchmark_command(config: BenchmarkConfig) -> None:
     check(config)
     if config.jobs < 1:
         raise ValueError(f"jobs must be at least 1, got {config.jobs}")
+    if config.executor not in ("local", "slurm"):
+        raise ValueError(f"executor must be local or slurm, got {config.executor!r}")
+    check_execution(config.executor, config.shards, config.slurm)
     store, wanted = Store(config.store), steps(config)
     if config.plan:
         _print_plan(store, wanted)
+        return
+    if config.executor == "slurm":
+        _submit(config)
         return
     with tqdm(total=len(in_order(wanted)), desc=config.name, unit="step") as bar:
 
@@ -57,11 +73,29 @@ def benchmark_command(config: BenchmarkConfig) -> None:
             bar.update()
 
         Engine(store, config.jobs, watch).run(wanted)
-    results = collect(config, store)
-    document = config.document or Path("outputs/benchmark") / config.name
+    results, document = collect(config, store), _document(config)
     for suffix, text in ((".json", json.dumps(results, indent=1)), (".md", markdown(results))):
         write_atomically(document.with_suffix(suffix), lambda file, text=text: file.write(text.encode()))
     print(f"Report: {document.with_suffix('.md')}")
+
+
+def _document(config: BenchmarkConfig) -> Path:
+    return config.document or Path("outputs/benchmark") / config.name
+
+
+def _submit(config: BenchmarkConfig) -> None:
+    """Let jobs do the steps: they share the store, as commands on one machine do. The last one does what they left."""
+    logs, alone = log_folder(_document(config)), replace(config, executor="local", jobs=1)
+    array, last = submit_to_slurm(
+        partial(_do_steps, alone), partial(benchmark_command, alone), "hdril_benchmark",
+        config.shards, config.shards, config.slurm, logs,
+    )  # fmt: skip
+    print(f"Submitted {config.shards} jobs as job {array}; job {last} then makes {_document(config)}.md")
+    print(f"Logs: {logs}; after a failure, the same command does what is missing")
+
+
+def _do_steps(config: BenchmarkConfig, rank: int, world_size: int) -> None:
+    Engine(Store(config.store), config.jobs).run(steps(config))
 
 
 def _in_words(seconds: float) -> str:

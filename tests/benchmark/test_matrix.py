@@ -22,7 +22,9 @@ from hdril.benchmark.store import Store
 from hdril.cli.benchmark import BenchmarkConfig, benchmark_command
 from hdril.digest import digest_json
 from hdril.evaluation.results import Run, summarise
+from hdril.execution import SlurmConfig
 from tests.evaluation.synthetic import outcome
+from tests.fake_slurm import FakeSlurm
 
 ROOT = Path(__file__).parents[2]
 SEED, COUNT = 600_000, 8
@@ -262,6 +264,31 @@ def test_the_command_plans_and_reports_without_doing_what_is_done(
     assert (tmp_path / "report.md").read_text().startswith("# Benchmark: test\n")
     with pytest.raises(ValueError, match="jobs must be at least 1, got 0"):
         benchmark_command(replace(config, jobs=0))
+
+
+def test_on_slurm_jobs_share_the_steps_and_the_last_one_reports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    matrix, slurm = changed(one_row), FakeSlurm(tmp_path / "slurm", monkeypatch)
+    config = BenchmarkConfig(
+        **vars(matrix), store=tmp_path / "store", document=tmp_path / "report", executor="slurm", shards=3,
+        slurm=SlurmConfig("cpu"),
+    )  # fmt: skip
+    benchmark_command(config)
+    shards, finish = (job for job in slurm.jobs if "launch_pickled_pipeline" in job.script)
+    assert shards.options["array"] == "0-2%3"
+    assert "Submitted 3 jobs as job 100" in capsys.readouterr().out
+    assert not (tmp_path / "report.md").exists()
+    pretend(Store(tmp_path / "store"), matrix, fails)
+    shards.run(only=2)
+    finish.run()
+    assert (tmp_path / "report.md").read_text().startswith("# Benchmark: test\n")
+    for options, words in (
+        ({"executor": "ray"}, "executor must be local or slurm, got 'ray'"),
+        ({"slurm": SlurmConfig()}, r"--executor=slurm needs --slurm\.partition"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            benchmark_command(replace(config, **options))
 
 
 def test_outcomes_of_one_policy_do_not_differ_from_themselves(tmp_path: Path) -> None:

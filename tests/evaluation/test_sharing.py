@@ -16,9 +16,11 @@ from hdril.errors import UserError
 from hdril.evaluation import evaluate
 from hdril.evaluation.evaluate import make_job
 from hdril.evaluation.journal import Journal
+from hdril.execution import SlurmConfig
 from hdril.files import BusyError
 from tests.evaluation.checkpoints import experts_episode, listing, save_hdril, save_replay
 from tests.evaluation.synthetic import outcome
+from tests.fake_slurm import FakeSlurm
 
 SEED, COUNT = 930_000, 3
 
@@ -157,13 +159,27 @@ def test_options_that_do_nothing_together_are_refused(policy: Path, tmp_path: Pa
     assert not list(tmp_path.iterdir())
 
 
-# ---------------------------------------------------------------- real clusters
+# ---------------------------------------------------------------- clusters
 
 
 @pytest.fixture(scope="module")
 def untrained(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """HDR-IL that other processes can load."""
     return save_hdril(tmp_path_factory.mktemp("untrained") / "policy", dataset)
+
+
+def test_slurm_is_asked_for_shards_and_for_a_last_job_that_reports(
+    untrained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    slurm, output = FakeSlurm(tmp_path / "slurm", monkeypatch), tmp_path / "eval"
+    play(untrained, tmp_path / "alone", num_episodes=2)
+    play(untrained, output, num_episodes=2, shards=2, executor="slurm", slurm=SlurmConfig("cpu"))
+    assert "Submitted 2 shards as job 100" in capsys.readouterr().out
+    shards, finish = (job for job in slurm.jobs if "launch_pickled_pipeline" in job.script)
+    assert not output.exists()
+    shards.run(only=1)
+    finish.run()
+    assert reports(output) == reports(tmp_path / "alone")
 
 
 def command(policy: Path, output: Path, *options: str) -> str:

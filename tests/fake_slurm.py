@@ -1,0 +1,70 @@
+"""A Slurm that keeps what is submitted, and runs it when the test says so, one job after the other."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+SBATCH = """#!/bin/sh
+# Keeps the script, which is the last argument, and the other arguments.
+number=$((100 + $(ls "{folder}" | grep -c '\\.slurm$')))
+for last; do :; done
+cp "$last" "{folder}/$number.slurm"
+echo "$@" > "{folder}/$number.arguments"
+echo "Submitted batch job $number"
+"""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What was submitted."""
+
+    script: str
+    arguments: str
+
+    @property
+    def options(self) -> dict[str, str]:
+        """The script's options of sbatch."""
+        return dict(re.findall(r"^#SBATCH --([\w-]+)=(.*)$", self.script, re.MULTILINE))
+
+    def run(self, only: int | None = None) -> None:
+        """Run all ranks of the array, or only one; of datatrove's own jobs, none."""
+        found = re.search(r"launch_pickled_pipeline \S+", self.script)
+        if found is None:
+            return
+        first, last = map(int, self.options["array"].partition("%")[0].split("-"))
+        for rank in range(first, last + 1) if only is None else [only]:
+            variables = os.environ | {"SLURM_ARRAY_TASK_ID": str(rank), "SLURM_NODELIST": "localhost"}
+            command = f". {self._environment} && {found[0]}"
+            subprocess.run(["bash", "-c", command], env=variables, check=True, capture_output=True)
+
+    @property
+    def _environment(self) -> str:
+        """What the script activates."""
+        found = re.search(r"^source (\S+)$", self.script, re.MULTILINE)
+        assert found is not None
+        return found[1]
+
+
+class FakeSlurm:
+    """Stands for a cluster whose ``sbatch`` is on the PATH."""
+
+    def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
+        self._kept = folder / "jobs"
+        self._kept.mkdir(parents=True)
+        self.program = program = folder / "bin" / "sbatch"
+        program.parent.mkdir()
+        program.write_text(SBATCH.format(folder=self._kept))
+        program.chmod(0o755)
+        patch.setenv("PATH", f"{program.parent}{os.pathsep}{os.environ['PATH']}")
+
+    @property
+    def jobs(self) -> list[Job]:
+        """What was submitted, in order."""
+        files = sorted(self._kept.glob("*.slurm"), key=lambda file: int(file.stem))
+        return [Job(file.read_text(), file.with_suffix(".arguments").read_text()) for file in files]
