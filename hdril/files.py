@@ -17,6 +17,10 @@ MAX_SEED = 2**31 - 1
 """Largest seed of an episode."""
 
 
+_UMASK = os.umask(0)  # it can only be read by setting it
+os.umask(_UMASK)
+
+
 def cache_folder() -> Path:
     """Folder of what can be made again: ``hdril`` in ``$XDG_CACHE_HOME``, or in ``~/.cache``."""
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "hdril"
@@ -29,6 +33,7 @@ def write_atomically(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     try:
         with os.fdopen(descriptor, "wb") as file:
             write(file)
+        os.chmod(temporary, 0o666 & ~_UMASK)  # mkstemp lets nobody else read it
         os.replace(temporary, path)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)

@@ -49,3 +49,9 @@ def test_a_failure_inside_ends_the_lock(tmp_path: Path) -> None:
         raise KeyError
     with exclusively(tmp_path, "going on"):
         pass
+
+
+def test_others_may_read_what_was_written_as_far_as_the_user_lets_them(tmp_path: Path) -> None:
+    (tmp_path / "plain").write_text("as any program writes")
+    write_atomically(tmp_path / "whole", lambda file: file.write(b"x"))
+    assert (tmp_path / "whole").stat().st_mode == (tmp_path / "plain").stat().st_mode

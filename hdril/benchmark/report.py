@@ -12,8 +12,8 @@ SIGNIFICANCE = 0.05
 """Family-wise error of the tests of a table."""
 
 
-def markdown(results: Mapping[str, Any]) -> str:
-    """The report."""
+def markdown(results: Mapping[str, Any], pictures: Sequence[Sequence[str]] = ()) -> str:
+    """The report, with links to the pictures of each table, if there are any."""
     machine = results["machine"]
     blocks = [
         f"# Benchmark: {results['name']}",
@@ -22,8 +22,10 @@ def markdown(results: Mapping[str, Any]) -> str:
         "for one trained policy. Several trainings are written as trainings × seeds: the mean, then the range and the standard "
         "deviation over trainings. No seed of an evaluation was trained or tuned on. Commands stand at the end.",
     ]
-    for table in results["tables"]:
+    shown = pictures or [()] * len(results["tables"])
+    for table, names in zip(results["tables"], shown, strict=True):
         blocks += [f"## {table['title']}", *([table["note"]] if table["note"] else []), _seeds(table), _rows(table)]
+        blocks += [f"![{table['title']}]({name})" for name in names]
         blocks += _tests(table)
     blocks += ["## Commands", *_commands(results)]
     return "\n\n".join(blocks) + "\n"

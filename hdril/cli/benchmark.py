@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -13,14 +12,13 @@ from tqdm import tqdm
 
 from hdril.benchmark.engine import Engine, Progress, in_order
 from hdril.benchmark.matrix import Matrix, check, steps
-from hdril.benchmark.report import markdown
+from hdril.benchmark.page import write_report
 from hdril.benchmark.results import collect
 from hdril.benchmark.steps import Step
 from hdril.benchmark.store import Store
 from hdril.cli.common import run
 from hdril.cli.shards import log_folder
 from hdril.execution import SlurmConfig, check_execution, submit_to_slurm
-from hdril.files import write_atomically
 
 
 @dataclass
@@ -34,7 +32,7 @@ class BenchmarkConfig(Matrix):
     store: Path = Path("outputs/benchmark/store")
     """Folder of all results."""
     document: Path | None = None
-    """Where the report goes, without suffix: .md and .json. Default: outputs/benchmark/<name>."""
+    """Where the report goes, without suffix: .html, .md, .json and figures. Default: outputs/benchmark/<name>/<name>."""
     jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Steps at a time; each has one thread."""
     plan: bool = False
@@ -74,13 +72,12 @@ def benchmark_command(config: BenchmarkConfig) -> None:
 
         Engine(store, config.jobs, watch).run(wanted)
     results, document = collect(config, store), _document(config)
-    for suffix, text in ((".json", json.dumps(results, indent=1)), (".md", markdown(results))):
-        write_atomically(document.with_suffix(suffix), lambda file, text=text: file.write(text.encode()))
-    print(f"Report: {document.with_suffix('.md')}")
+    write_report(document, results)
+    print(f"Report: {document.with_suffix('.html')}, and as Markdown beside it")
 
 
 def _document(config: BenchmarkConfig) -> Path:
-    return config.document or Path("outputs/benchmark") / config.name
+    return config.document or Path("outputs/benchmark") / config.name / config.name
 
 
 def _submit(config: BenchmarkConfig) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ import pytest
 
 from hdril.benchmark.engine import in_order
 from hdril.benchmark.matrix import Matrix, check, rows, steps
+from hdril.benchmark.page import write_report
 from hdril.benchmark.report import markdown
 from hdril.benchmark.results import collect
 from hdril.benchmark.steps import Evaluate, Step
@@ -247,6 +249,29 @@ def test_the_report_says_what_was_found(tmp_path: Path) -> None:
     assert "Against" not in text
 
 
+def test_the_page_holds_all_that_it_shows(tmp_path: Path) -> None:
+    matrix, store = changed(lambda values: values["tables"][0].update(training_seeds=[1])), Store(tmp_path / "store")
+    pretend(store, matrix, fails)
+    results = collect(matrix, store)
+    files = write_report(tmp_path / "out/test", results)
+    names = {path.name for path in files}
+    pictures = {f"test_1_{name}.{kind}" for name in ("success", "demonstrations") for kind in ("png", "svg")}
+    assert names == {"test.json", "test.md", "test.html"} | pictures
+    assert names == {path.name for path in (tmp_path / "out").iterdir()}
+    page, text = ((tmp_path / f"out/test.{kind}").read_text() for kind in ("html", "md"))
+    assert "![Lift](test_1_success.png)" in text
+    assert page.count("<svg") == 2
+    assert "<img" not in page
+    assert "<table>" in page
+    parts = re.findall(r' id="([^"]+)"', page)
+    assert len(parts) == len(set(parts)), "names of parts are unique"
+    assert set(re.findall(r'(?:xlink:href="|url\()#([^")]+)', page)) <= set(parts)
+    assert str(tmp_path) not in page
+    before = {path.name: path.read_bytes() for path in files}
+    write_report(tmp_path / "out/test", results)
+    assert {path.name: path.read_bytes() for path in files} == before, "the same numbers make the same files"
+
+
 def test_the_command_plans_and_reports_without_doing_what_is_done(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -261,6 +286,7 @@ def test_the_command_plans_and_reports_without_doing_what_is_done(
     monkeypatch.setattr("hdril.benchmark.engine.start", None)  # doing a step would fail
     benchmark_command(replace(config, plan=False))
     assert json.loads((tmp_path / "report.json").read_text())["name"] == "test"
+    assert (tmp_path / "report.html").exists()
     assert (tmp_path / "report.md").read_text().startswith("# Benchmark: test\n")
     with pytest.raises(ValueError, match="jobs must be at least 1, got 0"):
         benchmark_command(replace(config, jobs=0))

@@ -1,0 +1,83 @@
+"""The figures of a benchmark: success with its interval, and success over demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#F0E442")
+"""Okabe and Ito's colours, which people with any kind of colour blindness can tell apart (jfly.uni-koeln.de/color)."""
+MARKERS = "osD^v<>P"
+"""A shape for each colour: no figure needs colour to be read."""
+
+
+def figures(table: Mapping[str, Any]) -> dict[str, Figure]:
+    """The figures of a table of ``benchmark.json``, by what they show: ``success``; ``demonstrations``, where there are rows
+    of more than one number of demonstrations."""
+    found = {"success": _success(table)}
+    if len({row["demonstrations"] for row in table["rows"]}) > 1:
+        found["demonstrations"] = _over_demonstrations(table)
+    return found
+
+
+def _success(table: Mapping[str, Any]) -> Figure:
+    """A line for each row, with a mark for each evaluation and training, and its interval over seeds."""
+    from matplotlib.figure import Figure
+
+    rows, names = table["rows"], list(table["evaluations"])
+    figure = Figure(figsize=(7.5, 1.3 + 0.22 * len(rows) * len(names)), layout="constrained")
+    axes = figure.subplots()
+    labels = []
+    for place, row in enumerate(rows):
+        labels.append(f"{row['policy']}, {row['demonstrations']} of {row['data']}")
+        for number, name in enumerate(names):
+            y = place + (number - (len(names) - 1) / 2) * 0.8 / len(names)
+            _mark(axes, row["cells"][name], y, number, name if place == 0 else None)
+    axes.set_yticks(range(len(rows)), labels)
+    axes.invert_yaxis()
+    axes.set(xlim=(-2, 102), xlabel="success, %", title=table["title"])
+    axes.grid(axis="x", alpha=0.3)
+    axes.legend(loc="lower left", bbox_to_anchor=(1.0, 0.0), frameon=False)
+    return figure
+
+
+def _mark(axes: Axes, runs: Sequence[Mapping[str, Any]], y: float, number: int, label: str | None) -> None:
+    """A mark with its interval for each training, close to one another."""
+    colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
+    for i, run in enumerate(runs):
+        at = y + 0.08 * (i - (len(runs) - 1) / 2)
+        axes.plot(run["pc_success_ci95"], [at, at], color=colour, linewidth=1.0)
+        axes.plot([run["pc_success"]], [at], marker, color=colour, markersize=4.0, label=label if i == 0 else None)
+
+
+def _over_demonstrations(table: Mapping[str, Any]) -> Figure:
+    """A panel for each evaluation, a curve for each policy: the mean over trainings, and a mark for each training."""
+    from matplotlib.figure import Figure
+
+    names = list(table["evaluations"])
+    policies = list(dict.fromkeys((row["policy"], row["data"]) for row in table["rows"]))
+    figure = Figure(figsize=(1.0 + 3.2 * len(names), 3.2), layout="constrained")
+    panels = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
+    for panel, name in zip(panels, names, strict=True):
+        for number, (policy, data) in enumerate(policies):
+            rows = [row for row in table["rows"] if (row["policy"], row["data"]) == (policy, data)]
+            rows.sort(key=lambda row: row["demonstrations"])
+            counts = [row["demonstrations"] for row in rows]
+            rates = [[run["pc_success"] for run in row["cells"][name]] for row in rows]
+            colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
+            means = [sum(each) / len(each) for each in rates]
+            panel.plot(counts, means, color=colour, marker=marker, markersize=4.5, label=f"{policy}, {data}")
+            for count, each in zip(counts, rates, strict=True):
+                panel.plot([count] * len(each), each, marker, color=colour, markersize=2.5, alpha=0.6)
+        panel.set(xscale="log", xlabel="demonstrations", title=name, ylim=(-2, 102))
+        panel.set_xticks(sorted({row["demonstrations"] for row in table["rows"]}))
+        panel.get_xaxis().set_major_formatter("{x:.0f}")
+        panel.minorticks_off()
+        panel.grid(alpha=0.3)
+    panels[0].set_ylabel("success, %")
+    panels[-1].legend(fontsize=8, frameon=False, loc="lower left", bbox_to_anchor=(1.0, 0.0))
+    return figure

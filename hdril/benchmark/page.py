@@ -1,0 +1,75 @@
+"""The report of a benchmark as files: Markdown, one self-contained HTML page, its figures and its numbers."""
+
+from __future__ import annotations
+
+import html
+import io
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hdril.benchmark.figures import figures
+from hdril.benchmark.report import markdown
+from hdril.files import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_STYLE = (
+    "body{font:15px/1.5 sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#1c2733}"
+    "table{border-collapse:collapse;margin:1rem 0;display:block;overflow-x:auto}"
+    "td,th{border:1px solid #c8d2dc;padding:.25rem .6rem;text-align:left}th{background:#eef3f8}"
+    "pre{background:#f4f6f8;padding:.8rem;overflow-x:auto;font-size:12px}svg{max-width:100%;height:auto}"
+)
+
+
+def write_report(document: Path, results: Mapping[str, Any]) -> list[Path]:
+    """Write ``<document>.json``, ``.md`` and ``.html``, and each figure as ``<document>_<number>_<name>.png`` and ``.svg``.
+
+    The page holds everything that it shows. Returns the files.
+    """
+    drawn = [figures(table) for table in results["tables"]]
+    files: dict[Path, bytes] = {document.with_suffix(".json"): json.dumps(results, indent=1).encode()}
+    names = []
+    for number, found in enumerate(drawn, 1):
+        names.append([f"{document.name}_{number}_{name}" for name in found])
+        for name, figure in zip(names[-1], found.values(), strict=True):
+            for kind in ("png", "svg"):
+                files[document.with_name(f"{name}.{kind}")] = _picture(figure, kind)
+    files[document.with_suffix(".md")] = markdown(
+        results, [[f"{name}.png" for name in each] for each in names]
+    ).encode()
+    pictures = {f"{name}.png": files[document.with_name(f"{name}.svg")].decode() for each in names for name in each}
+    files[document.with_suffix(".html")] = _page(files[document.with_suffix(".md")].decode(), pictures).encode()
+    for path, data in files.items():
+        write_atomically(path, lambda file, data=data: file.write(data))
+    return list(files)
+
+
+def _picture(figure: Figure, kind: str) -> bytes:
+    """The same bytes for the same numbers: without the time of drawing, and with names of parts that do not change."""
+    import matplotlib
+
+    buffer = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": "hdril", "svg.fonttype": "path"}):
+        figure.savefig(buffer, format=kind, dpi=110, metadata={"Date": None} if kind == "svg" else {"Software": None})
+    return buffer.getvalue()
+
+
+def _page(text: str, pictures: Mapping[str, str]) -> str:
+    """Markdown as a page, with its pictures in place of the links to them."""
+    from markdown_it import MarkdownIt
+
+    body = MarkdownIt("commonmark").enable("table").render(text)
+    for number, (name, picture) in enumerate(pictures.items()):
+        inline = picture[picture.index("<svg") :]
+        # Names of parts are the same in every picture; in one page they must differ.
+        inline = re.sub(r'(id="|href="#|url\(#)', rf"\g<1>p{number}_", inline)
+        body = re.sub(rf'<img src="{re.escape(name)}"[^>]*>', lambda _, inline=inline: inline, body)
+    title = html.escape(text.splitlines()[0].lstrip("# "))
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style></head>'
+        f"<body>{body}</body></html>\n"
+    )
