@@ -307,9 +307,9 @@ class HDRILPolicy(PreTrainedPolicy):
     def features(self, state: Tensor, filtered: Tensor) -> Tensor:
         """What the fused maps see of states (B, S) and of the mean of the last ones (B, S)."""
         assert self.frames is not None
-        given = [state, filtered] if self.config.filter_frames > 1 else [state]
-        seen = [(self.frames.features(each) - self.feature_mean) / self.feature_std for each in given]
-        return torch.cat(seen, dim=-1)
+        given = torch.cat([state, filtered]) if self.config.filter_frames > 1 else state
+        seen = (self.frames.features(given) - self.feature_mean) / self.feature_std
+        return torch.cat(seen.split(len(state)), dim=-1)
 
     def _fused(self, state: Tensor, filtered: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
         """Normalised outputs (B, M, A + S) of the fused maps; 0 for the states, which they do not predict."""
