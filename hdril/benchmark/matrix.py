@@ -10,6 +10,9 @@ from hdril.benchmark.steps import Evaluate, Record, Train
 from hdril.files import MAX_SEED
 from hdril.tasks import base_name, get_task
 
+ERRORS = {"position_error_cm": "position, cm", "angle_error_rad": "angle, rad", "dtw_cm": "DTW, cm"}
+"""Errors against the expert by their name in ``results.json``, and what a column is called."""
+
 
 @dataclass
 class DataSpec:
@@ -73,6 +76,12 @@ class TableSpec:
     """Seeds of weights and batches, one training each."""
     against: str = ""
     """The policy that the others are compared with, on the same demonstrations and seeds."""
+    errors: list[str] = field(default_factory=list)
+    """Errors against the expert that are shown beside success: position_error_cm, angle_error_rad, dtw_cm."""
+    published: dict[str, str] = field(default_factory=dict)
+    """Numbers of others beside ours, as text, by policy."""
+    published_by: str = "published"
+    """Whose they are: the heading of their column."""
     note: str = ""
     """What a reader should know, as Markdown."""
 
@@ -175,10 +184,12 @@ def _check_table(matrix: Matrix, table: TableSpec) -> None:
         ("policies", table.policies, matrix.policies),
         ("evaluations", table.evaluations, matrix.evaluations),
         ("against", [table.against] if table.against else [], table.policies),
+        ("errors", table.errors, ERRORS),
+        ("published", list(table.published), table.policies),
     ):
         if missing := [name for name in names if name not in known]:
             raise ValueError(f"table {table.title!r}: {kind} has no {missing[0]!r}; choose from: {', '.join(known)}")
-        if not names and kind != "against":
+        if not names and kind not in ("against", "errors", "published"):
             raise ValueError(f"table {table.title!r} names no {kind}; choose from: {', '.join(known)}")
     if not table.training_seeds:
         raise ValueError(f"table {table.title!r} names no training_seeds")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from hdril.benchmark.matrix import ERRORS
 from hdril.evaluation.statistics import TrainingSpread
 from hdril.markdown import table as markdown_table
 
@@ -41,12 +42,20 @@ def _seeds(table: Mapping[str, Any]) -> str:
 
 
 def _rows(table: Mapping[str, Any]) -> str:
-    heads = ["policy", "trained on", "demonstrations", "minutes of training", *table["evaluations"]]
+    names, errors, published = table["evaluations"], table["errors"], table["published"]
+    heads = ["policy", "trained on", "demonstrations", "minutes of training"]
+    heads += [head for name in names for head in (name, *(f"{name}: {ERRORS[error]}" for error in errors))]
+    heads += [table["published_by"]] if published else []
     lines = []
     for row in table["rows"]:
         minutes = row["training_minutes"]
         spent = f"{min(minutes):.1f}" if len(minutes) == 1 else f"{min(minutes):.1f} to {max(minutes):.1f}"
-        cells = (_cell(row["cells"][name]) for name in table["evaluations"])
+        cells = [
+            cell
+            for name in names
+            for cell in (_cell(row["cells"][name]), *(_error(row["cells"][name], error) for error in errors))
+        ]
+        cells += [published.get(row["policy"], "")] if published else []
         lines.append([f"`{row['policy']}`", row["data"], row["demonstrations"], spent, *cells])
     return markdown_table(heads, lines)
 
@@ -57,6 +66,15 @@ def _cell(runs: Sequence[Mapping[str, Any]]) -> str:
     (run,) = runs
     low, high = run["pc_success_ci95"]
     return f"{run['n_success']} of {run['n_episodes']}: {run['pc_success']:.1f} ({low:.1f} to {high:.1f})"
+
+
+def _error(runs: Sequence[Mapping[str, Any]], name: str) -> str:
+    """The mean over episodes of each training's error, to three digits, and the range over trainings if there are several."""
+    means = [run[name]["mean"] for run in runs if run[name] is not None]
+    if not means:
+        return ""
+    spread = f" ({min(means):.3g} to {max(means):.3g})" if len(means) > 1 else ""
+    return f"{sum(means) / len(means):.3g}{spread}"
 
 
 def _tests(table: Mapping[str, Any]) -> list[str]:

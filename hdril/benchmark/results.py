@@ -46,6 +46,9 @@ def _table(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
         "training_seeds": table.training_seeds,
         "rows": found,
         "against": table.against,
+        "errors": table.errors,
+        "published": table.published,
+        "published_by": table.published_by,
         "tests": _tests(matrix, table, found),
     }
 

@@ -127,6 +127,8 @@ def test_a_change_of_hdril_does_not_touch_what_it_does_not_make(monkeypatch: pyt
     ("change", "words"),
     [
         (lambda v: v["tables"][0].update(policies=["gru"]), "policies has no 'gru'; choose from: linear, act, hdril"),
+        (lambda v: v["tables"][0].update(errors=["speed"]), "errors has no 'speed'; choose from: position_error_cm"),
+        (lambda v: v["tables"][0].update(published={"gru": "1 %"}), "published has no 'gru'; choose from: linear, act, hdril"),
         (lambda v: v["tables"][0].update(against="gru"), "against has no 'gru'; choose from: linear, act, hdril"),
         (lambda v: v["tables"][0].update(evaluations=[]), "names no evaluations; choose from: nominal, varied"),
         (lambda v: v["tables"][0].update(training_seeds=[]), "names no training_seeds"),
@@ -242,11 +244,29 @@ def test_the_report_says_what_was_found(tmp_path: Path) -> None:
     assert "`varied`: `table_lift:level=varied`, 8 seeds from 600000 on. Training seeds: 1, 2." in text
     assert "adjusted by Holm's method for the 4 tests of the table" in text
     assert "not shown" in text
+    assert "published" not in text
     assert "hdril-eval --policy.path=STORE/train/" in text
     single = changed(lambda values: (one_row(values), values["tables"][0].update(training_seeds=[2], against="")))
     text = markdown(collect(single, store))
     assert "| 6 of 8: 75.0 (40.9 to 92.9) " in text
     assert "Against" not in text
+
+
+def test_errors_and_published_numbers_stand_beside_success(tmp_path: Path) -> None:
+    def more(values: dict[str, Any]) -> None:
+        one_row(values)
+        values["tables"][0].update(errors=["position_error_cm"], published={"linear": "13 %"}, published_by="paper")
+
+    matrix, store = changed(more), Store(tmp_path / "store")
+    pretend(store, matrix, fails)
+    lines = [line for line in markdown(collect(matrix, store)).splitlines() if line.startswith("| ")]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[:4]]
+    assert cells[0][-3:] == ["varied", "varied: position, cm", "paper"]
+    assert [row[-2:] for row in cells[1:]] == [
+        ["0.2 (0.2 to 0.2)", "13 %"],
+        ["0.2 (0.2 to 0.2)", ""],
+        ["0.2 (0.2 to 0.2)", ""],
+    ]
 
 
 def test_the_page_holds_all_that_it_shows(tmp_path: Path) -> None:
