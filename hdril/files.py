@@ -44,6 +44,19 @@ class BusyError(UserError):
     """Another process works on the same files."""
 
 
+def is_busy(folder: Path) -> bool:
+    """Whether another process is in ``folder`` by :func:`exclusively`."""
+    if not (folder / "lock").exists():
+        return False
+    lock = FileLock(folder / "lock", blocking=False)
+    try:
+        lock.acquire()
+    except Timeout:
+        return True
+    lock.release()
+    return False
+
+
 @contextmanager
 def exclusively(folder: Path, doing: str) -> Iterator[None]:
     """Keep other processes out of ``folder``, which is made if it is not there, by a lock file in it.

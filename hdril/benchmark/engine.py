@@ -12,6 +12,7 @@ from hdril.benchmark.perform import BUSY, Assignment, start
 from hdril.benchmark.steps import Step
 from hdril.benchmark.store import LOG, Store
 from hdril.errors import UserError
+from hdril.files import is_busy
 
 POLL = 0.2
 """s until the running steps are looked at again."""
@@ -136,6 +137,9 @@ class Engine:
                 continue
             place, made_from = self._store.place(step), self._store.made_from(step)
             if place is None or made_from is None:
+                continue
+            if is_busy(place):  # by another engine
+                self._later[step] = now + PATIENCE
                 continue
             assignment = Assignment(step, place, self._store.input_folders(step), made_from)
             self._running.append(_Running(step, start(assignment)))

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from hdril.benchmark.steps import Evaluate, Record, Train
+from hdril.demonstrations.record import PATIENCE
 from hdril.files import MAX_SEED
 from hdril.tasks import base_name, get_task
+
+_OF_TRAINING = (
+    "config_path", "dataset.root", "dataset.repo_id", "dataset.episodes", "output_dir", "steps", "save_freq", "seed", "resume",
+    "policy.path", "policy.pretrained_path",
+)  # fmt: skip
+_OF_EVALUATION = (
+    "config_path", "policy.path", "task", "num_episodes", "seed", "rerun", "workers", "output_dir", "against", "suite", "cells",
+    "push", "shards", "shard", "executor",
+)  # fmt: skip
+"""What the benchmark sets by itself, so that the matrix says what was done; or what it cannot keep track of."""
 
 ERRORS = {"position_error_cm": "position, cm", "angle_error_rad": "angle, rad", "dtw_cm": "DTW, cm"}
 """Errors against the expert by their name in ``results.json``, and what a column is called."""
@@ -19,13 +31,11 @@ class DataSpec:
     """Demonstrations."""
 
     task: str
-    """Name of the task, with its parameters (table_lift:level=varied)."""
+    """Name of the task, with its parameters (table_lift:level=varied, table_lift:push=0.3)."""
     episodes: int
     """Episodes to record."""
     seed: int = 0
     """First seed."""
-    events: str = ""
-    """What happens to the demonstrations, as hdril-record has it."""
     perturb: float = 0.0
     """Noise that the robot gets and the record does not, m, as hdril-record has it."""
 
@@ -121,7 +131,7 @@ def rows(matrix: Matrix, table: TableSpec) -> Iterator[Row]:
     """The rows of a table, with the steps that fill them."""
     for name in table.data:
         spec = matrix.data[name]
-        record = Record(spec.task, spec.episodes, spec.seed, spec.events, spec.perturb)
+        record = Record(spec.task, spec.episodes, spec.seed, spec.perturb)
         for count in table.demonstrations or [spec.episodes]:
             for policy in table.policies:
                 made = matrix.policies[policy]
@@ -155,20 +165,37 @@ def check(matrix: Matrix) -> None:
             and the valid choices.
         FileNotFoundError: there is no such config file.
     """
+    if not re.fullmatch(r"[\w.-]+", matrix.name):
+        raise ValueError(f"name must be of letters, digits, '.', '_' and '-', got {matrix.name!r}")
     for name, data in matrix.data.items():
         get_task(data.task)
         _check_seeds(f"data {name}", data.seed, data.episodes)
+        if data.perturb < 0.0:
+            raise ValueError(f"data {name}: perturb must not be negative, got {data.perturb}")
     for name, policy in matrix.policies.items():
         if not policy.config.exists():
             raise FileNotFoundError(f"policy {name}: there is no config file {policy.config}")
         if policy.steps < 1:
             raise ValueError(f"policy {name}: steps must be at least 1, got {policy.steps}")
+        _check_options(f"policy {name}", policy.options, _OF_TRAINING)
+        Train(
+            name, Record("table_lift", 1), 1, policy.config, tuple(policy.options), 1, 0
+        ).settings()  # what it needs is there
     for name, evaluation in matrix.evaluations.items():
         get_task(evaluation.task)
         _check_seeds(f"evaluation {name}", evaluation.seed, evaluation.episodes)
+        _check_options(f"evaluation {name}", evaluation.options, _OF_EVALUATION)
     for table in matrix.tables:
         _check_table(matrix, table)
     check_held_out(matrix)
+
+
+def _check_options(what: str, options: list[str], known: tuple[str, ...]) -> None:
+    """Raises ValueError for an option that the benchmark sets, or that would set others unseen."""
+    for option in options:
+        name = option.partition("=")[0].replace("-", "_").removeprefix("__")
+        if name in known:
+            raise ValueError(f"{what}: --{name} cannot be among its options")
 
 
 def _check_seeds(what: str, first: int, count: int) -> None:
@@ -191,6 +218,9 @@ def _check_table(matrix: Matrix, table: TableSpec) -> None:
             raise ValueError(f"table {table.title!r}: {kind} has no {missing[0]!r}; choose from: {', '.join(known)}")
         if not names and kind not in ("against", "errors", "published"):
             raise ValueError(f"table {table.title!r} names no {kind}; choose from: {', '.join(known)}")
+        _check_once(table, kind, names)
+    _check_once(table, "training_seeds", table.training_seeds)
+    _check_once(table, "demonstrations", table.demonstrations)
     if not table.training_seeds:
         raise ValueError(f"table {table.title!r} names no training_seeds")
     for name in table.data:
@@ -200,6 +230,11 @@ def _check_table(matrix: Matrix, table: TableSpec) -> None:
         task = base_name(matrix.data[name].task)
         if other := [key for key in table.evaluations if base_name(matrix.evaluations[key].task) != task]:
             raise ValueError(f"table {table.title!r}: evaluation {other[0]} is not of {task}, the task of data {name}")
+
+
+def _check_once(table: TableSpec, kind: str, values: Sequence[object]) -> None:
+    if twice := [value for value in values if values.count(value) > 1]:
+        raise ValueError(f"table {table.title!r}: {kind} has {twice[0]!r} twice")
 
 
 def check_held_out(matrix: Matrix) -> None:
@@ -230,5 +265,7 @@ def check_held_out(matrix: Matrix) -> None:
 
 
 def _seeds(spec: DataSpec | EvaluationSpec) -> range:
-    # Demonstrations that fail are dropped, and further seeds take their place: at most half of them fail.
-    return range(spec.seed, spec.seed + spec.episodes * (2 if isinstance(spec, DataSpec) else 1))
+    if isinstance(spec, EvaluationSpec):
+        return range(spec.seed, spec.seed + spec.episodes)
+    # Demonstrations that fail are dropped, and further seeds take their place.
+    return range(spec.seed, spec.seed + 2 * spec.episodes + PATIENCE)

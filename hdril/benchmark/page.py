@@ -30,19 +30,21 @@ def write_report(document: Path, results: Mapping[str, Any]) -> list[Path]:
 
     The page holds everything that it shows. Returns the files.
     """
+
+    def beside(suffix: str) -> Path:
+        return document.with_name(document.name + suffix)
+
     drawn = [figures(table) for table in results["tables"]]
-    files: dict[Path, bytes] = {document.with_suffix(".json"): json.dumps(results, indent=1).encode()}
+    files: dict[Path, bytes] = {beside(".json"): json.dumps(results, indent=1).encode()}
     names = []
     for number, found in enumerate(drawn, 1):
         names.append([f"{document.name}_{number}_{name}" for name in found])
         for name, figure in zip(names[-1], found.values(), strict=True):
             for kind in ("png", "svg"):
                 files[document.with_name(f"{name}.{kind}")] = _picture(figure, kind)
-    files[document.with_suffix(".md")] = markdown(
-        results, [[f"{name}.png" for name in each] for each in names]
-    ).encode()
+    files[beside(".md")] = markdown(results, [[f"{name}.png" for name in each] for each in names]).encode()
     pictures = {f"{name}.png": files[document.with_name(f"{name}.svg")].decode() for each in names for name in each}
-    files[document.with_suffix(".html")] = _page(files[document.with_suffix(".md")].decode(), pictures).encode()
+    files[beside(".html")] = _page(files[beside(".md")].decode(), pictures).encode()
     for path, data in files.items():
         write_atomically(path, lambda file, data=data: file.write(data))
     return list(files)

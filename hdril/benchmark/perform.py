@@ -21,7 +21,8 @@ from threading import Thread
 from typing import Any
 
 from hdril.benchmark.steps import Folders, Step
-from hdril.benchmark.store import DONE, LOG, RESULT, mark_done
+from hdril.benchmark.store import DONE, LOG, RESULT, is_done, mark_done
+from hdril.digest import digest_json
 from hdril.files import BusyError, exclusively
 
 BUSY = os.EX_TEMPFAIL
@@ -41,7 +42,10 @@ class Assignment:
 def start(assignment: Assignment) -> subprocess.Popen[bytes]:
     """Start a process that does the step. Its exit code is 0, :data:`BUSY`, or that of the command that failed."""
     command = [sys.executable, "-m", "hdril.benchmark.perform"]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    # In a session of its own: whatever ends this process and its group leaves that one to end what it started.
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
+    )
     assert process.stdin is not None
     process.stdin.write(pickle.dumps(assignment))
     process.stdin.flush()  # and stays open: that it is closed means that this process is gone
@@ -57,8 +61,10 @@ def perform(assignment: Assignment) -> int:
     """
     step, place = assignment.step, assignment.place
     with exclusively(place, f"doing {step.title}"):
-        if (place / DONE).exists():
+        if is_done(place):
             return 0
+        (place / DONE).unlink(missing_ok=True)  # somebody deleted the result
+        _check_unchanged(assignment)
         output = place / RESULT
         if not step.resumes:
             shutil.rmtree(output, ignore_errors=True)
@@ -67,15 +73,24 @@ def perform(assignment: Assignment) -> int:
         # A result without step.json is whole if the process was killed between the two: the command would refuse it.
         code = 0 if step.resumes and output.exists() else _run(command, place / LOG)
         if code == 0:
+            _check_unchanged(assignment)
             mark_done(place, step, assignment.made_from, shlex.join(command), time.monotonic() - begun)
-        return code
+        return code if code != BUSY else 1
+
+
+def _check_unchanged(assignment: Assignment) -> None:
+    """Raises ValueError if what decides the result is not what it was when the benchmark began: a file was edited."""
+    now, then = assignment.step.settings(), assignment.made_from["settings"]
+    if digest_json(now) != digest_json(then):
+        changed = ", ".join(sorted(key for key in then if digest_json(now.get(key)) != digest_json(then[key])))
+        raise ValueError(f"{changed} changed while the benchmark ran: start it again")
 
 
 def _run(command: list[str], log: Path) -> int:
     """Run a command, its output into the log, until it ends or the process that started this one is gone."""
     program = Path(sys.executable).parent / command[0]
     # The matrices are small: a second thread slows training down, and another step has the other processor.
-    variables = os.environ | {"OMP_NUM_THREADS": "1", "HDRIL_DEBUG": "1"}
+    variables = os.environ | {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "HDRIL_DEBUG": "1"}
     with log.open("ab") as file:
         file.write(f"$ {shlex.join(command)}\n".encode())
         file.flush()
@@ -97,11 +112,12 @@ def _end_with_parent(process: subprocess.Popen[bytes]) -> None:
 
 def main() -> None:
     """Entry point."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the process that started this one
     try:
         code = perform(pickle.load(sys.stdin.buffer))
     except BusyError:
         code = BUSY
+    except (OSError, ValueError) as error:
+        sys.exit(str(error))
     sys.exit(code)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,17 +11,17 @@ from hdril.benchmark.matrix import ERRORS
 from hdril.evaluation.statistics import TrainingSpread
 from hdril.markdown import table as markdown_table
 
+_LISTED = re.compile(r"'?--dataset\.episodes=(\[[\d, ]+\])'?")
 SIGNIFICANCE = 0.05
 """Family-wise error of the tests of a table."""
 
 
 def markdown(results: Mapping[str, Any], pictures: Sequence[Sequence[str]] = ()) -> str:
     """The report, with links to the pictures of each table, if there are any."""
-    machine = results["machine"]
     blocks = [
         f"# Benchmark: {results['name']}",
-        f"Made by `hdril-benchmark` of hdril {results['hdril_version']}, one thread a step, on {machine['cores']} cores "
-        f"({machine['processor']}, {machine['system']}). Success is in percent, with the 95 % interval (Wilson) over the seeds "
+        f"Made by `hdril-benchmark` of hdril {results['hdril_version']}, one thread a step, on {'; '.join(results['machines'])}. "
+        "Success is in percent, with the 95 % interval (Wilson) over the seeds "
         "for one trained policy. Several trainings are written as trainings × seeds: the mean, then the range and the standard "
         "deviation over trainings. No seed of an evaluation was trained or tuned on. Commands stand at the end.",
     ]
@@ -93,11 +95,17 @@ def _tests(table: Mapping[str, Any]) -> list[str]:
             ]
         )  # fmt: skip
     count = sum(len(test["p_values"]) for test in table["tests"])
+    several = len(table["training_seeds"]) > 1
+    interval = "two-level bootstrap over trainings and seeds" if several else "Newcombe, over seeds"
+    caution = (
+        "Few trainings show little of how trainings differ: such an interval is rather too narrow."
+        if several
+        else "One training of each tells two trained policies apart, not two methods."
+    )
     return [
-        f"Against `{table['against']}`, seed by seed: the difference in points with its 95 % interval (bootstrap over trainings "
-        f"and seeds), p of McNemar's exact test for each pair of trainings, adjusted by Holm's method for the {count} tests of "
-        f"the table, and whether all are below {SIGNIFICANCE}. One training of each tells two trained policies apart, "
-        "not two methods.",
+        f"Against `{table['against']}`, seed by seed: the difference in points with its 95 % interval ({interval}), p of "
+        f"McNemar's exact test for each pair of trainings, adjusted by Holm's method for the {count} tests of the table, and "
+        f"whether all are below {SIGNIFICANCE}. {caution}",
         markdown_table(["policy", "trained on", "demonstrations", "evaluation", "difference", "p", "differs"], lines),
     ]
 
@@ -109,4 +117,10 @@ def _commands(results: Mapping[str, Any]) -> list[str]:
         for row in table["rows"]:
             found |= dict.fromkeys(row["training_commands"])
             found |= dict.fromkeys(run["command"] for runs in row["cells"].values() for run in runs)
-    return ["```\n" + "\n".join(found) + "\n```"]
+    return ["```\n" + "\n".join(re.sub(_LISTED, _first_of, command) for command in found) + "\n```"]
+
+
+def _first_of(listed: re.Match[str]) -> str:
+    """The choice of the first demonstrations, in short."""
+    numbers = json.loads(listed[1])
+    return f"--dataset.episodes=[0,…,{numbers[-1]}]"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import platform
 from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any
@@ -13,10 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdril import __version__
-from hdril.benchmark.matrix import EvaluationSpec, Matrix, Row, TableSpec, rows
+from hdril.benchmark.engine import in_order
+from hdril.benchmark.matrix import EvaluationSpec, Matrix, Row, TableSpec, rows, steps
 from hdril.benchmark.steps import Evaluate
 from hdril.benchmark.store import Store
-from hdril.evaluation.statistics import bootstrap_difference, holm, mcnemar_exact, paired_counts
+from hdril.evaluation.statistics import (
+    bootstrap_difference,
+    holm,
+    mcnemar_exact,
+    paired_counts,
+    paired_difference_interval,
+)
 from hdril.evaluation.stored import RESULTS
 
 _KEPT = ("n_episodes", "n_success", "pc_success", "pc_success_ci95", "held_out", "position_error_cm", "angle_error_rad",
@@ -28,11 +33,12 @@ def collect(matrix: Matrix, store: Store) -> dict[str, Any]:
 
     Raises:
         KeyError: a step is not done.
+        ValueError: an evaluation holds other seeds than the matrix says.
     """
     return {
         "name": matrix.name,
         "hdril_version": __version__,
-        "machine": {"processor": platform.machine(), "system": platform.system(), "cores": os.cpu_count()},
+        "machines": sorted({store.get(step).machine for step in in_order(steps(matrix))}),
         "tables": [_table(matrix, table, store) for table in matrix.tables],
     }
 
@@ -70,6 +76,8 @@ def _run(step: Evaluate, store: Store) -> dict[str, Any]:
     """One evaluation: its numbers, what was evaluated, and the command. ``failed_seeds`` lets a reader pair two policies."""
     done = store.get(step)
     results = json.loads((done.output / RESULTS).read_text())
+    if [episode["seed"] for episode in results["per_episode"]] != list(step.seeds):
+        raise ValueError(f"{done.output} holds other seeds than {step.title} asks for")
     return {key: results[key] for key in _KEPT} | {
         "training_seed": step.policy.seed,
         "weights": results["identity"]["policy"]["weights"],
@@ -113,10 +121,14 @@ def _compare(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> dict[str, A
         first: (trainings, seeds) outcomes.
         second: (trainings, seeds) outcomes.
     """
-    low, high = bootstrap_difference(first, second)
-    pairs = zip(first.tolist(), second.tolist(), strict=True)
+    pairs = [
+        paired_counts(dict(enumerate(a)), dict(enumerate(b)))
+        for a, b in zip(first.tolist(), second.tolist(), strict=True)
+    ]
+    alone = len(pairs) == 1
+    low, high = paired_difference_interval(pairs[0]) if alone else bootstrap_difference(first, second)
     return {
         "pc_difference": 100.0 * float(first.mean() - second.mean()),
         "pc_difference_ci95": [100.0 * low, 100.0 * high],
-        "p_values": [mcnemar_exact(paired_counts(dict(enumerate(a)), dict(enumerate(b)))) for a, b in pairs],
+        "p_values": [mcnemar_exact(counts) for counts in pairs],
     }

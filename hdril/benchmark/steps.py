@@ -6,19 +6,24 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from hdril.demonstrations.provenance import read_provenance
-from hdril.digest import digest_file, digest_files
+from hdril.digest import digest_file, digest_files, digest_json
 from hdril.evaluation.checkpoint import Checkpoint
+from hdril.evaluation.held_out import STATISTICS
+from hdril.evaluation.overrides import ELSEWHERE
 from hdril.evaluation.software import (
     distribution_version,
-    episode_software,
     evaluation_software,
     package_software,
+    policy_software,
+    recording_software,
+    source_software,
 )
 from hdril.evaluation.stored import RESULTS
 from hdril.tasks import base_name
@@ -69,7 +74,6 @@ class Record(Step):
     task: str
     episodes: int
     first_seed: int = 0
-    events: str = ""
     perturb: float = 0.0
 
     kind = "record"
@@ -79,11 +83,10 @@ class Record(Step):
         return f"{self.episodes} demonstrations of {self.task}"
 
     def settings(self) -> dict[str, Any]:
-        return dict(vars(self)) | {"software": episode_software(base_name(self.task))}
+        return dict(vars(self)) | {"software": recording_software(base_name(self.task))}
 
     def command(self, output: Path, inputs: Folders) -> list[str]:
-        options = [f"--events={self.events}"] if self.events else []
-        options += [f"--perturb={self.perturb:g}"] if self.perturb else []
+        options = [f"--perturb={self.perturb:g}"] if self.perturb else []
         return ["hdril-record", f"--task={self.task}", f"--num_episodes={self.episodes}", f"--seed={self.first_seed}",
                 *options, "--workers=1", f"--root={output}"]  # fmt: skip
 
@@ -91,7 +94,10 @@ class Record(Step):
         provenance = read_provenance(output)
         if provenance is None or not provenance.digest:
             raise ValueError(f"{output} is no dataset of hdril with a digest")
-        return provenance.digest
+        # Policies learn from the statistics, too.
+        return digest_json(
+            [provenance.digest, *(digest_file(output / name) for name in ("meta/info.json", STATISTICS))]
+        )
 
 
 @dataclass(frozen=True)
@@ -122,15 +128,32 @@ class Train(Step):
     @property
     def policy_type(self) -> str:
         """The type of the policy, as LeRobot names it."""
-        given = [option.partition("=")[2] for option in self.options if option.startswith("--policy.type=")]
-        return given[-1] if given else yaml.safe_load(self.config.read_text())["policy"]["type"]
+        return str(self._decided("type"))
+
+    def _decided(self, name: str) -> object:
+        """An option of the policy, as the command line or the config file gives it.
+
+        Raises:
+            ValueError: neither does.
+        """
+        given = [option.partition("=")[2] for option in self.options if option.startswith(f"--policy.{name}=")]
+        told = yaml.safe_load(self.config.read_text())
+        values = (told.get("policy") if isinstance(told, dict) else None) or {}
+        if not given and name not in values:
+            raise ValueError(f"policy {self.name}: neither its options nor {self.config} say --policy.{name}")
+        return given[-1] if given else values[name]
 
     def settings(self) -> dict[str, Any]:
-        config = {"config": digest_file(self.config), "options": list(self.options), "steps": self.steps}
-        software = {name: distribution_version(name) for name in ("lerobot", "torch", "numpy")}
-        if self.policy_type in ("hdril", "nearest"):
-            software |= package_software("lerobot_policy_hdril")
-        return config | {"episodes": self.episodes, "seed": self.seed, "software": software}
+        software = _training_software(self.policy_type)
+        return {
+            "config": digest_file(self.config),
+            "options": list(self.options),
+            "device": self._decided("device"),  # unless told, LeRobot takes what the machine has
+            "episodes": self.episodes,
+            "steps": self.steps,
+            "seed": self.seed,
+            "software": software,
+        }
 
     def command(self, output: Path, inputs: Folders) -> list[str]:
         subset = [] if self.episodes == self.data.episodes else [f"--dataset.episodes={list(range(self.episodes))}"]
@@ -144,8 +167,26 @@ class Train(Step):
 
     def digest(self, output: Path) -> str:
         checkpoint = Checkpoint("trained", self.checkpoint(output))
-        # Not train_config.json, which holds the folder of the output.
-        return digest_files([checkpoint.weights, *checkpoint.processors])
+        # The same weights may act otherwise by another config. Not train_config.json, which holds the folder of the output.
+        config = {key: value for key, value in checkpoint.read_config().items() if key not in ELSEWHERE}
+        return digest_json([digest_files([checkpoint.weights, *checkpoint.processors]), config])
+
+
+def _training_software(policy_type: str) -> dict[str, str]:
+    """What decides a training, the versions of the libraries and the sources of the policy."""
+    software = {name: distribution_version(name) for name in ("lerobot", "torch", "numpy")}
+    if policy_type in ("hdril", "nearest"):
+        return software | package_software("lerobot_policy_hdril")
+    lerobot = find_spec("lerobot")
+    places = list(lerobot.submodule_search_locations or []) if lerobot else []
+    if any((Path(place) / "policies" / policy_type).is_dir() for place in places):
+        return software
+    # A plugin's: LeRobot must be imported to find it, which takes seconds.
+    from lerobot.policies.factory import get_policy_class
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    return software | policy_software(get_policy_class(policy_type))
 
 
 @dataclass(frozen=True)
@@ -167,12 +208,17 @@ class Evaluate(Step):
         return f"{self.policy.title}: {self.name}"
 
     @property
+    def seeds(self) -> range:
+        return range(self.first_seed, self.first_seed + self.episodes)
+
+    @property
     def inputs(self) -> Mapping[str, Step]:
         return {"policy": self.policy}
 
     def settings(self) -> dict[str, Any]:
         trials = {"task": self.task, "episodes": self.episodes, "first_seed": self.first_seed}
-        software = evaluation_software(base_name(self.task)) | self.policy.settings()["software"]
+        software = evaluation_software(base_name(self.task)) | _training_software(self.policy.policy_type)
+        software |= {"results": source_software("evaluation/results.py")["hdril"]}
         return trials | {"options": list(self.options), "software": software}
 
     def command(self, output: Path, inputs: Folders) -> list[str]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import platform
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +25,8 @@ class Done:
     digest: str
     seconds: float
     command: str
+    machine: str = ""
+    """What did it."""
 
 
 class Store:
@@ -42,10 +46,12 @@ class Store:
         """What is known of a step that is done; None if it is not."""
         if step not in self._done:
             place = self.place(step)
-            if place is None or not (place / DONE).exists():
+            if place is None or not is_done(place):
                 return None
             told = json.loads((place / DONE).read_text())
-            self._done[step] = Done(place / RESULT, told["digest"], told["seconds"], told["command"])
+            self._done[step] = Done(
+                place / RESULT, told["digest"], told["seconds"], told["command"], told["machine"]
+            )  # fmt: skip
         return self._done[step]
 
     def place(self, step: Step) -> Path | None:
@@ -85,6 +91,11 @@ class Store:
         return command.replace(f"{self.folder}/", "STORE/")
 
 
+def is_done(place: Path) -> bool:
+    """Whether the result of a step is there, and whole."""
+    return (place / DONE).exists() and (place / RESULT).exists()
+
+
 def mark_done(place: Path, step: Step, made_from: Mapping[str, Any], command: str, seconds: float) -> None:
     """Say that the result of a step is whole.
 
@@ -92,5 +103,10 @@ def mark_done(place: Path, step: Step, made_from: Mapping[str, Any], command: st
         OSError, ValueError: it is not.
     """
     told = {"title": step.title, "digest": step.digest(place / RESULT), "seconds": round(seconds, 1),
-            "command": command, "made_from": made_from}  # fmt: skip
+            "command": command, "machine": _machine(), "made_from": made_from}  # fmt: skip
     write_atomically(place / DONE, lambda file: file.write(json.dumps(told, indent=1).encode()))
+
+
+def _machine() -> str:
+    """The kind of this machine, without its name."""
+    return f"{platform.machine()}, {platform.system()}, {os.cpu_count()} cores"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -49,11 +50,16 @@ class BenchmarkConfig(Matrix):
 def benchmark_command(config: BenchmarkConfig) -> None:
     """Do what is left, and report."""
     check(config)
+    if not re.fullmatch(r"[\w.-]+", _document(config).name):
+        raise ValueError(f"document must end with letters, digits, '.', '_' and '-', got {_document(config).name!r}")
     if config.jobs < 1:
         raise ValueError(f"jobs must be at least 1, got {config.jobs}")
     if config.executor not in ("local", "slurm"):
         raise ValueError(f"executor must be local or slurm, got {config.executor!r}")
-    check_execution(config.executor, config.shards, config.slurm)
+    if config.executor == "local" and (config.shards != 1 or config.slurm != SlurmConfig()):
+        raise ValueError("--shards and --slurm.* are for --executor=slurm; --jobs is for this machine")
+    if not config.plan:
+        check_execution(config.executor, config.shards, config.slurm)
     store, wanted = Store(config.store), steps(config)
     if config.plan:
         _print_plan(store, wanted)
@@ -73,7 +79,7 @@ def benchmark_command(config: BenchmarkConfig) -> None:
         Engine(store, config.jobs, watch).run(wanted)
     results, document = collect(config, store), _document(config)
     write_report(document, results)
-    print(f"Report: {document.with_suffix('.html')}, and as Markdown beside it")
+    print(f"Report: {document}.html, and as Markdown beside it")
 
 
 def _document(config: BenchmarkConfig) -> Path:
@@ -82,7 +88,10 @@ def _document(config: BenchmarkConfig) -> Path:
 
 def _submit(config: BenchmarkConfig) -> None:
     """Let jobs do the steps: they share the store, as commands on one machine do. The last one does what they left."""
-    logs, alone = log_folder(_document(config)), replace(config, executor="local", jobs=1)
+    logs, alone = (
+        log_folder(_document(config)),
+        replace(config, executor="local", shards=1, slurm=SlurmConfig(), jobs=1),
+    )
     array, last = submit_to_slurm(
         partial(_do_steps, alone), partial(benchmark_command, alone), "hdril_benchmark",
         config.shards, config.shards, config.slurm, logs,

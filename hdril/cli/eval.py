@@ -95,6 +95,8 @@ def _check(config: EvalConfig) -> None:
     if config.push:
         check_repo_id("push", config.push)
     check_shards(config, bool(config.push))
+    if config.in_shards and config.executor != "ray" and config.output_dir is None:
+        raise ValueError("shards need --output_dir: the command that goes on must find what they played")
     for name, least in (("num_episodes", 1), ("seed", 0), ("workers", 1)):
         if getattr(config, name) < least:
             raise ValueError(f"{name} must be at least {least}, got {getattr(config, name)}")
@@ -130,6 +132,7 @@ def eval_command(config: EvalConfig, overrides: tuple[str, ...] = ()) -> None:
     if output.exists():
         check_finished(read_evaluation(output), config, job)
     else:
+        read_other(config.against, job)  # what cannot be compared is told before anything is played
         if play_elsewhere(config, config.rerun, {output: job}, output, finish):
             return
         start = time.monotonic()
@@ -162,7 +165,7 @@ def describe(job: Job, held_out: HeldOut) -> Run:
 def check_finished(evaluation: StoredEvaluation, config: EvalConfig, job: Job) -> None:
     """Raises ValueError unless a finished evaluation is the one that is asked for."""
     evaluation.require(job.identity)
-    if (against := _read_other(config.against, job)) is not None:
+    if (against := read_other(config.against, job)) is not None:
         evaluation.require_comparison(against)
 
 
@@ -170,7 +173,7 @@ def evaluate_into(
     output: Path, config: EvalConfig, job: Job, held_out: HeldOut, pool: Executor | None = None
 ) -> dict[str, Any]:
     """Evaluate a job, in ``pool`` if it is given, and write the report to ``output``; returns the data of ``results.json``."""
-    against = _read_other(config.against, job)
+    against = read_other(config.against, job)
     journal = Journal(output, job.identity)
     with journal.writing() as add:
         play_seeds(job, job.seeds, journal, add, config.rerun, config.workers, pool)
@@ -188,7 +191,7 @@ def _announce(summary: Mapping[str, Any], output: Path, seconds: float) -> None:
         print(f"{len(recordings)} recordings: hdril-view --run={output}")
 
 
-def _read_other(folder: Path | None, job: Job) -> StoredEvaluation | None:
+def read_other(folder: Path | None, job: Job) -> StoredEvaluation | None:
     """The evaluation to compare with. Raises ValueError unless it is of the same trials."""
     if folder is None:
         return None

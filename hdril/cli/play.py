@@ -54,13 +54,24 @@ def play_seeds(
             bar.update()
 
 
-def play_share(jobs: Mapping[Path, Job], keep: str, shard: int, shards: int, workers: int = 1) -> None:
+def play_share(
+    jobs: Mapping[Path, Job],
+    keep: str,
+    begin: Callable[[], object] | None,
+    shard: int,
+    shards: int,
+    workers: int = 1,
+) -> None:
     """Play one share of the seeds of every job, for the evaluation in the job's folder, which finds what was played.
+
+    ``begin`` is called first, if there is one.
 
     Raises:
         ValueError: there is no such shard; the checkpoint is not what it was; the folder holds something else.
         BusyError: another process plays this share.
     """
+    if begin is not None:
+        begin()
     for folder, job in jobs.items():
         if folder.exists():  # a cell of a suite that is finished
             continue
@@ -70,7 +81,12 @@ def play_share(jobs: Mapping[Path, Job], keep: str, shard: int, shards: int, wor
 
 
 def play_elsewhere(
-    options: PlayOptions, keep: str, jobs: Mapping[Path, Job], output: Path, finish: Callable[[], object]
+    options: PlayOptions,
+    keep: str,
+    jobs: Mapping[Path, Job],
+    output: Path,
+    finish: Callable[[], object],
+    begin: Callable[[], object] | None = None,
 ) -> bool:
     """Let shards be played, if ``options`` ask for it.
 
@@ -80,16 +96,24 @@ def play_elsewhere(
         jobs: what is evaluated, by the folder of each.
         output: the folder of all results.
         finish: picklable; plays what is missing and reports.
+        begin: picklable; what each shard does first.
 
     Returns:
         Whether there is nothing more to do here: one shard was played, or jobs were submitted.
+
+    Raises:
+        ValueError, FileExistsError: a folder holds something else; nothing is written.
     """
+    if options.in_shards:
+        for folder, job in jobs.items():
+            if not folder.exists():
+                Journal(folder, job.identity)
     jobs = {folder.resolve(): job for folder, job in jobs.items()}
     if options.shard is not None:
-        play_share(jobs, keep, options.shard, options.shards, options.workers)
+        play_share(jobs, keep, begin, options.shard, options.shards, options.workers)
         print(f"Shard {options.shard} of {options.shards} is played; the same command without --shard makes the report")
         return True
-    work, logs = partial(play_share, jobs, keep), log_folder(output)
+    work, logs = partial(play_share, jobs, keep, begin), log_folder(output)
     if options.executor == "slurm":
         array, last = submit_to_slurm(work, finish, "hdril_eval", options.shards, options.workers, options.slurm, logs)
         print(f"Submitted {options.shards} shards as job {array}; job {last} then makes {output}")

@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from hdril.cli.eval import EvalConfig, check_finished, evaluate_into
+from hdril.cli.eval import EvalConfig, check_finished, evaluate_into, read_other
 from hdril.cli.play import play_elsewhere
 from hdril.evaluation.evaluate import Job
 from hdril.evaluation.held_out import HeldOut
@@ -44,11 +44,12 @@ def evaluate_suite(
     """
     names = [name for name in config.cells.split(",") if name]
     cells = choose(SUITES[config.suite](config.task, detailed), names)
-    unfinished = UnfinishedFolder(output, "suite", "suite_run.json", _identity(config, nominal, cells))
+    # Shards may run in other folders than this command.
+    unfinished = UnfinishedFolder(output.resolve(), "suite", "suite_run.json", _identity(config, nominal, cells))
     jobs = {unfinished.folder / cell.name: _job(nominal, cell) for cell in cells}
-    if config.in_shards:
-        unfinished.begin_share()
-    if play_elsewhere(config, config.rerun, jobs, output, finish):
+    for folder, job in jobs.items():
+        read_other(_against(config, folder.name), job)  # what cannot be compared is told before anything is played
+    if play_elsewhere(config, config.rerun, jobs, output, finish, unfinished.begin_share):
         return
     start = time.monotonic()
     with unfinished.writing(), _pool(min(config.workers, config.num_episodes)) as pool:
@@ -85,12 +86,16 @@ def _pool(workers: int) -> Iterator[Executor | None]:
         yield pool
 
 
+def _against(config: EvalConfig, cell: str) -> Path | None:
+    """The other policy's folder of a cell."""
+    return None if config.against is None else config.against / cell
+
+
 def _evaluate_cell(
     output: Path, config: EvalConfig, job: Job, held_out: HeldOut, pool: Executor | None
 ) -> dict[str, Any]:
     """The results of a cell, from before if it is finished."""
-    against = None if config.against is None else config.against / output.name
-    config = replace(config, against=against)
+    config = replace(config, against=_against(config, output.name))
     if not output.exists():
         return evaluate_into(output, config, job, held_out, pool)
     finished = read_evaluation(output)

@@ -51,7 +51,9 @@ class Journal:
             ValueError, FileExistsError: as for the class, if another process wrote here since.
         """
         # Files count, too: what another process played since must stay if it cannot be read.
-        with self._unfinished.writing(begun=lambda: bool(self.done or self._read())):
+        with self._unfinished.writing(
+            begun=lambda: (self.folder / _SHARDS).exists() or bool(self.done or self._read())
+        ):
             self.done = self._read()
             with self._appending(self.folder / _OUTCOMES) as add:
                 yield add
@@ -80,7 +82,9 @@ class Journal:
 
             def add(outcome: Outcome) -> None:
                 if not path.exists():
-                    raise UserError(f"{path.parent} was removed by another process, which finished the evaluation")
+                    raise UserError(
+                        f"{path.parent} was removed by another process, which finished the evaluation or gave it up"
+                    )
                 file.write(json.dumps(asdict(outcome)) + "\n")
                 file.flush()
                 self.done[outcome.seed] = outcome

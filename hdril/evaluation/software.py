@@ -87,19 +87,33 @@ def _package_files(module: str) -> list[Path]:
 
 def episode_software(task: str, robot: str = "baxter") -> dict[str, str]:
     """What decides an episode of given actions on a task (its name without parameters): the scene, and how it goes on."""
-    return {
-        "hdril": f"{hdril.__version__} ({_source_digest(_EPISODE)})",
-        "pybullet": distribution_version("pybullet"),
-        "numpy": distribution_version("numpy"),
-        "scipy": distribution_version("scipy"),
-        "robot model": _robot_model(robot),
-    } | _task_source(task)
+    return (
+        source_software(*_EPISODE)
+        | {
+            "pybullet": distribution_version("pybullet"),
+            "numpy": distribution_version("numpy"),
+            "scipy": distribution_version("scipy"),
+            "robot model": _robot_model(robot),
+        }
+        | _task_source(task)
+    )
 
 
 def evaluation_software(task: str, robot: str = "baxter") -> dict[str, str]:
     """What decides scenes, the expert's episodes and scores: the same for any policy."""
-    scores = {"hdril": f"{hdril.__version__} ({_source_digest(_SCORES)})"}
+    scores = source_software(*_SCORES)
     return episode_software(task, robot) | scores | {"dtaidistance": distribution_version("dtaidistance")}
+
+
+def source_software(*parts: str) -> dict[str, str]:
+    """Version of hdril, with the digest of some of its sources: files and folders, by their path in the package."""
+    return {"hdril": f"{hdril.__version__} ({_source_digest(parts)})"}
+
+
+def recording_software(task: str, robot: str = "baxter") -> dict[str, str]:
+    """What decides a recorded dataset of a task: episodes, their noise and labels, columns and statistics."""
+    libraries = {name: distribution_version(name) for name in ("lerobot", "pyarrow")}
+    return episode_software(task, robot) | source_software(*_EPISODE, "demonstrations") | libraries
 
 
 def policy_software(policy_class: type) -> dict[str, str]:

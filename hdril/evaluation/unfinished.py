@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,10 +12,17 @@ from typing import Any
 
 from hdril.evaluation.checkpoint import read_json
 from hdril.evaluation.identity import require_same
-from hdril.files import exclusively, write_atomically
+from hdril.files import BusyError, exclusively, write_atomically
 
 _LOCK = "lock"
+_PATIENCE = 30.0
+"""s that a share waits for others that begin at the same time."""
 _REMEDY = "delete it or choose another output_dir"
+
+
+def _is_scrap(name: str) -> bool:
+    """Whether a file of this name is what a killed process left of one that it was writing."""
+    return name.startswith(".") and name.endswith(".tmp")
 
 
 class UnfinishedFolder:
@@ -40,14 +48,24 @@ class UnfinishedFolder:
     def _check(self) -> None:
         if self.output.exists():
             raise FileExistsError(f"{self.output} exists; choose another output_dir or delete it")
-        if (self.folder / self._record).exists():
-            record = read_json(self.folder / self._record)
-            require_same(str(self.folder), record.get(self._key) if self._key else record, self._identity, _REMEDY)
-        elif self._holds_more_than(_LOCK):
+        # Another process may write its record between the two looks: then the second one sees it.
+        if not self._same() and self._holds_more_than(_LOCK) and not self._same():
             raise FileExistsError(f"{self.folder} exists and is no {self._kind}; {_REMEDY}")
 
+    def _same(self) -> bool:
+        """Whether the folder holds results of the same; raises ValueError if they are of something else."""
+        path = self.folder / self._record
+        if not path.exists():
+            return False
+        record = read_json(path)
+        require_same(str(self.folder), record.get(self._key) if self._key else record, self._identity, _REMEDY)
+        return True
+
     def _holds_more_than(self, *names: str) -> bool:
-        return self.folder.exists() and any(path.name not in names for path in self.folder.iterdir())
+        """Whether there are other files and folders than these. What a kill left of a file that was being written counts
+        as nothing."""
+        there = [path.name for path in self.folder.iterdir()] if self.folder.exists() else []
+        return any(name not in names and not _is_scrap(name) for name in there)
 
     @contextmanager
     def writing(self, begun: Callable[[], bool] | None = None) -> Iterator[None]:
@@ -74,9 +92,21 @@ class UnfinishedFolder:
 
         Raises:
             ValueError, FileExistsError: as for the class, if another process wrote here since.
+            BusyError: another process holds the folder, and does not say what for.
         """
-        self._check()
-        self._write_record()
+        until = time.monotonic() + _PATIENCE
+        while True:
+            self._check()
+            if self._same():
+                return
+            try:
+                with exclusively(self.folder, f"evaluating into {self.output}"):
+                    self._check()
+                    self._write_record()
+            except BusyError:  # another share begins: it writes the same in a moment
+                if time.monotonic() > until:
+                    raise
+                time.sleep(0.05)
 
     def _write_record(self) -> None:
         record = json.dumps({self._key: self._identity} if self._key else self._identity, indent=2)
@@ -102,6 +132,11 @@ class UnfinishedFolder:
         Raises:
             OSError: a file, or a folder that is not empty, is at ``output`` by now; the folder stays.
         """
-        for path in (self.folder / name for name in (self._record, *scratch, _LOCK)):
-            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
         self.folder.replace(self.output)
+        # Afterwards: if the process were killed before the folder is renamed, what was played would be lost with these.
+        scraps = [path.name for path in self.output.iterdir() if _is_scrap(path.name)]
+        for path in (self.output / name for name in (*scratch, *scraps, self._record, _LOCK)):
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)  # a share that is late may still write there
+            else:
+                path.unlink(missing_ok=True)

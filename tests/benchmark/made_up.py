@@ -19,7 +19,6 @@ with Path(count).open("a") as file:
 parts = [text, *((Path(folder) / "text").read_text() for folder in inputs)]
 output = Path(output)
 output.mkdir(parents=True)
-(output / "half").touch()
 time.sleep(float(pause))
 if text.startswith("broken"):
     sys.exit("this step cannot be done")
@@ -37,10 +36,10 @@ class Words(Step):
     made_from: tuple[Words, ...] = ()
     pause: float = field(default=0.0, compare=False)
     """s between the beginning and the end; decides nothing."""
-    comment: str = field(default="", compare=False)
+
+    resumes: bool = field(default=False, compare=False)
 
     kind = "words"
-    resumes = False
 
     @property
     def title(self) -> str:
@@ -51,7 +50,8 @@ class Words(Step):
         return {str(i): step for i, step in enumerate(self.made_from)}
 
     def settings(self) -> dict[str, Any]:
-        return {"text": self.text}
+        edited = self.count.with_name("edited")  # stands for a config file, or a source
+        return {"text": self.text, "edition": edited.read_text() if edited.exists() else ""}
 
     def command(self, output: Path, inputs: Folders) -> list[str]:
         return [sys.executable, "-c", PROGRAM, self.text, str(self.pause), str(self.count), str(output),

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections import Counter
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+import psutil
 import pytest
 
 from hdril.benchmark.engine import Engine, Progress, in_order
 from hdril.benchmark.steps import Step
 from hdril.benchmark.store import Store
 from hdril.errors import UserError
-from tests.benchmark.made_up import Words
+from tests.benchmark.made_up import PROGRAM, Words
 
 
 @pytest.fixture
@@ -151,6 +154,63 @@ def test_killed_again_and_again_it_ends_with_the_same_and_repeats_nothing(store:
     assert text_of(store, top) == "(top (left (bottom)) (right (bottom)))"
     assert all(begun(count)[title] == before[title] for title in done), "what was done is not done again"
     assert not list(store.folder.rglob("*.tmp"))
+
+
+def alive(place: Path) -> list[str]:
+    """Command lines of processes that write below a folder."""
+    lines = []
+    for process in psutil.process_iter():
+        with suppress(psutil.NoSuchProcess, psutil.AccessDenied):
+            lines.append(" ".join(process.cmdline()))
+    return [line for line in lines if str(place) in line and PROGRAM.strip().splitlines()[0] in line]
+
+
+@pytest.mark.parametrize("group", [False, True], ids=["the engine alone", "its whole group"])
+def test_no_command_outlives_a_killed_engine(store: Store, count: Path, group: bool) -> None:
+    process = start(store, count, 600.0)
+    until = time.monotonic() + 60
+    while not alive(store.folder) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert alive(store.folder)
+    (os.killpg if group else os.kill)(process.pid, signal.SIGKILL)
+    process.wait()
+    until = time.monotonic() + 20
+    while alive(store.folder) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not alive(store.folder)
+
+
+def test_a_result_without_its_record_is_kept_where_the_command_would_refuse_it(store: Store, count: Path) -> None:
+    """The process was killed between the two."""
+    step = Words("step", count, resumes=True)
+    Engine(store, 1).run([step])
+    place = store.place(step)
+    assert place is not None
+    (place / "step.json").unlink()
+    Engine(Store(store.folder), 1).run([step])
+    assert begun(count) == {"step": 1}
+
+
+def test_a_result_that_was_deleted_is_made_again(store: Store, count: Path) -> None:
+    top = diamond(count)
+    Engine(store, 2).run([top])
+    for step in (top, top.made_from[0]):
+        shutil.rmtree(store.get(step).output)
+    again = Store(store.folder)
+    Engine(again, 2).run([top])
+    assert begun(count) == {"bottom": 1, "left": 2, "right": 1, "top": 2}
+    assert text_of(again, top) == "(top (left (bottom)) (right (bottom)))"
+
+
+def test_what_is_edited_while_the_engine_runs_is_not_taken_for_what_it_was(store: Store, count: Path) -> None:
+    top = diamond(count)
+    store.made_from(top.made_from[0].made_from[0])  # the engine has looked at it
+    count.with_name("edited").write_text("second edition")
+    with pytest.raises(UserError, match=r"edition changed while the benchmark ran: start it again"):
+        Engine(store, 2).run([top])
+    assert not count.exists(), "nothing was begun"
+    Engine(Store(store.folder), 2).run([top])
+    assert sum(begun(count).values()) == 4
 
 
 def test_two_engines_share_the_work(store: Store, count: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import re
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from hdril.cli.benchmark import BenchmarkConfig, benchmark_command
 from hdril.digest import digest_json
 from hdril.evaluation.results import Run, summarise
 from hdril.execution import SlurmConfig
+from tests.evaluation.checkpoints import save_hdril
 from tests.evaluation.synthetic import outcome
 from tests.fake_slurm import FakeSlurm
 
@@ -106,7 +108,7 @@ def test_what_decides_a_result_is_in_its_settings_and_nothing_else(tmp_path: Pat
         assert not same(train, **changes), changes
     assert not same(evaluate, options=("--policy.rollout=open_loop",))
     assert not same(record, perturb=0.001)
-    assert not same(record, events="push=1")
+    assert not same(record, task="table_lift:push=1")
     config = tmp_path / "train.yaml"
     config.write_text(train.config.read_text())
     assert same(train, config=config), "a config file counts by its content"
@@ -133,6 +135,11 @@ def test_a_change_of_hdril_does_not_touch_what_it_does_not_make(monkeypatch: pyt
         (lambda v: v["tables"][0].update(evaluations=[]), "names no evaluations; choose from: nominal, varied"),
         (lambda v: v["tables"][0].update(training_seeds=[]), "names no training_seeds"),
         (lambda v: v["tables"][0].update(demonstrations=[51]), "data nominal has 1 to 50 demonstrations, got 51"),
+        (lambda v: v["tables"][0].update(training_seeds=[1, 1]), "training_seeds has 1 twice"),
+        (lambda v: v["tables"][0].update(demonstrations=[50, 50]), "demonstrations has 50 twice"),
+        (lambda v: v["tables"][0].update(policies=["hdril", "hdril"]), "policies has 'hdril' twice"),
+        (lambda v: v["data"]["nominal"].update(perturb=-0.1), "data nominal: perturb must not be negative, got -0.1"),
+        (lambda v: v.update(name="two words"), "name must be of letters, digits, .* got 'two words'"),
         (lambda v: v["policies"]["act"].update(steps=0), "policy act: steps must be at least 1, got 0"),
         (lambda v: v["data"]["nominal"].update(task="juggle"), "juggle"),
         (lambda v: v["evaluations"]["nominal"].update(episodes=0), "evaluation nominal: episodes must be at least 1, got 0"),
@@ -145,6 +152,32 @@ def test_what_cannot_be_is_refused_in_one_line(change: Callable[[dict[str, Any]]
     with pytest.raises(ValueError, match=words) as error:
         check(changed(change))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "option"),
+    [
+        ("policies", "act", "--steps=5"), ("policies", "act", "--dataset.root=elsewhere"), ("policies", "act", "--seed=3"),
+        ("policies", "act", "--policy.path=somewhere"), ("evaluations", "varied", "--seed=5"),
+        ("evaluations", "varied", "--num-episodes=5"), ("evaluations", "varied", "--task=peg_in_hole"),
+    ],
+)  # fmt: skip
+def test_options_do_not_undo_what_the_matrix_says(kind: str, name: str, option: str) -> None:
+    wanted = option.removeprefix("--").partition("=")[0].replace("-", "_")
+    with pytest.raises(ValueError, match=rf"{name}: --{wanted} cannot be among its options"):
+        check(changed(lambda values: values[kind][name].setdefault("options", []).append(option)))
+
+
+def test_a_policy_says_its_type_and_its_device(tmp_path: Path) -> None:
+    config = tmp_path / "train.yaml"
+    for text, words in (("batch_size: 8", "type"), ("policy: {type: hdril}", "device")):
+        config.write_text(text)
+        with pytest.raises(
+            ValueError, match=rf"policy hdril: neither its options nor .*train\.yaml say --policy\.{words}"
+        ):
+            check(changed(lambda values: values["policies"]["hdril"].update(config=str(config))))
+    config.write_text("policy: {type: hdril, device: cpu}")
+    check(changed(lambda values: values["policies"]["hdril"].update(config=str(config))))
 
 
 def test_seeds_that_were_trained_or_tuned_on_are_refused() -> None:
@@ -190,7 +223,7 @@ def pretend(store: Store, matrix: Matrix, failed: Callable[[Evaluate], set[int]]
         assert place is not None
         (place / "result").mkdir(parents=True)
         command = " ".join(step.command(place / "result", store.input_folders(step)))
-        done = {"digest": digest_json(step.title), "seconds": 90.0, "command": command}
+        done = {"digest": digest_json(step.title), "seconds": 90.0, "command": command, "machine": "a machine"}
         (place / "step.json").write_text(json.dumps(done))
         if isinstance(step, Evaluate):
             seeds = range(step.first_seed, step.first_seed + step.episodes)
@@ -205,6 +238,71 @@ def fails(step: Evaluate) -> set[int]:
     if step.policy.name == "linear":
         return set(range(SEED, SEED + (COUNT if step.policy.seed == 1 else 2)))
     return {SEED} if step.policy.name == "act" else set()
+
+
+def test_seeds_that_were_not_asked_for_are_no_result(tmp_path: Path) -> None:
+    matrix, store = changed(one_row), Store(tmp_path / "store")
+    pretend(store, matrix, fails)
+    path = store.get(steps(matrix)[0]).output / "results.json"
+    path.write_text(path.read_text().replace(f'"seed": {SEED},', '"seed": 5,'))
+    with pytest.raises(ValueError, match="holds other seeds than linear on 50"):
+        collect(matrix, store)
+
+
+def test_one_training_has_the_interval_of_one_training(tmp_path: Path) -> None:
+    """100 of 100 against 100 of 100 is not a difference of exactly 0: the bootstrap would say so."""
+    matrix = changed(lambda values: (one_row(values), values["tables"][0].update(training_seeds=[2])))
+    store = Store(tmp_path / "store")
+    pretend(store, matrix, lambda step: set())
+    results = collect(matrix, store)
+    low, high = results["tables"][0]["tests"][0]["pc_difference_ci95"]
+    assert low < -10.0 < 10.0 < high
+    assert "Newcombe, over seeds" in markdown(results)
+
+
+# ---------------------------------------------------------------- digests of results
+
+
+def test_what_a_training_made_is_weights_processors_and_config(dataset: Path, tmp_path: Path) -> None:
+    """Two policies of the same weights may act otherwise; where one goes on the Hub does not matter."""
+    train = steps(changed())[0].policy
+    save_hdril(train.checkpoint(tmp_path), dataset)
+    first = train.digest(tmp_path)
+
+    def edit(**values: Any) -> str:
+        path = train.checkpoint(tmp_path) / "config.json"
+        before = path.read_text()
+        path.write_text(json.dumps(json.loads(before) | values))
+        digest = train.digest(tmp_path)
+        path.write_text(before)
+        return digest
+
+    assert edit() == first
+    assert edit(repo_id="user/name") == first
+    assert edit(rollout="open_loop") != first
+    weights = train.checkpoint(tmp_path) / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:-1] + b"x")
+    second = train.digest(tmp_path)
+    assert second != first
+    processor = train.checkpoint(tmp_path) / "policy_preprocessor.json"
+    processor.write_text(processor.read_text() + "\n")
+    assert train.digest(tmp_path) not in (first, second)
+    processor.unlink()
+    with pytest.raises(FileNotFoundError):
+        train.digest(tmp_path)
+
+
+def test_what_a_recording_made_is_episodes_and_statistics(dataset: Path, tmp_path: Path) -> None:
+    record = steps(changed())[0].policy.data
+    copied = Path(shutil.copytree(dataset, tmp_path / "set"))
+    first = record.digest(copied)
+    assert first == record.digest(dataset)
+    statistics = copied / "meta/stats.json"
+    statistics.write_text(statistics.read_text() + "\n")
+    assert record.digest(copied) != first
+    (copied / "meta/hdril.json").unlink()
+    with pytest.raises(ValueError, match="is no dataset of hdril with a digest"):
+        record.digest(copied)
 
 
 def one_row(values: dict[str, Any]) -> None:
@@ -308,8 +406,13 @@ def test_the_command_plans_and_reports_without_doing_what_is_done(
     assert json.loads((tmp_path / "report.json").read_text())["name"] == "test"
     assert (tmp_path / "report.html").exists()
     assert (tmp_path / "report.md").read_text().startswith("# Benchmark: test\n")
-    with pytest.raises(ValueError, match="jobs must be at least 1, got 0"):
-        benchmark_command(replace(config, jobs=0))
+    for options, words in (
+        ({"jobs": 0}, "jobs must be at least 1, got 0"),
+        ({"shards": 4}, "--shards and --slurm.* are for --executor=slurm"),
+        ({"document": tmp_path / "my report"}, "document must end with letters, digits, .* got 'my report'"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            benchmark_command(replace(config, **options))
 
 
 def test_on_slurm_jobs_share_the_steps_and_the_last_one_reports(

@@ -7,6 +7,8 @@ import shutil
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -142,9 +144,80 @@ def test_a_shard_is_played_once_at_a_time_and_says_when_it_is_late(policy: Path,
         with journal.writing():
             assert set(journal.done) == {SEED, SEED + 1}
             journal.finish()
-        with pytest.raises(UserError, match="was removed by another process, which finished the evaluation"):
+        with pytest.raises(
+            UserError, match="was removed by another process, which finished the evaluation or gave it up"
+        ):
             add(outcome(SEED + 2))
     assert [path.name for path in (tmp_path / "eval").iterdir()] == []
+
+
+def test_shards_that_begin_at_the_same_moment_do_not_refuse_one_another(policy: Path, tmp_path: Path) -> None:
+    """As those of an array do."""
+    identity = make_job("table_lift", str(policy), SEED, COUNT).identity
+
+    def begin(number: int, shard: int) -> None:
+        with Journal(tmp_path / f"eval{number}", identity).sharing(shard, 8) as add:
+            add(outcome(SEED + shard))
+
+    with ThreadPoolExecutor(8) as pool:
+        for number in range(20):
+            list(pool.map(partial(begin, number), range(8)))
+            assert set(Journal(tmp_path / f"eval{number}", identity).done) == set(range(SEED, SEED + 8))
+
+
+def test_what_a_kill_left_of_the_record_keeps_nobody_out(policy: Path, tmp_path: Path) -> None:
+    identity = make_job("table_lift", str(policy), SEED, COUNT).identity
+    (tmp_path / "eval.partial").mkdir()
+    (tmp_path / "eval.partial/.run.json.x.tmp").write_text('{"ident')
+    journal = Journal(tmp_path / "eval", identity)
+    with journal.writing() as add:
+        add(outcome(SEED))
+        journal.finish()
+    assert not list((tmp_path / "eval").iterdir())
+
+
+def test_a_command_that_is_stopped_leaves_the_shards_alone(policy: Path, tmp_path: Path) -> None:
+    identity = make_job("table_lift", str(policy), SEED, COUNT).identity
+    with Journal(tmp_path / "eval", identity).sharing(0, 2) as add:
+        with pytest.raises(KeyboardInterrupt), Journal(tmp_path / "eval", identity).writing():
+            raise KeyboardInterrupt
+        add(outcome(SEED))
+    assert set(Journal(tmp_path / "eval", identity).done) == {SEED}
+
+
+def test_a_finish_that_is_killed_loses_nothing(policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    identity = make_job("table_lift", str(policy), SEED, COUNT).identity
+    journal = Journal(tmp_path / "eval", identity)
+
+    def killed(*_: object) -> None:
+        raise SystemExit
+
+    with journal.writing() as add:
+        add(outcome(SEED))
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "replace", killed)
+            with pytest.raises(SystemExit):
+                journal.finish()
+    assert set(Journal(tmp_path / "eval", identity).done) == {SEED}
+
+
+def test_what_cannot_be_is_told_before_shards_are_asked_for(
+    policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slurm = FakeSlurm(tmp_path / "slurm", monkeypatch)
+    cluster = {"shards": 2, "executor": "slurm", "slurm": SlurmConfig("cpu")}
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        play(policy, tmp_path / "eval", against=tmp_path / "nowhere", **cluster)
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        play(policy, tmp_path / "eval", against=tmp_path / "nowhere", suite="factors", cells="push", **cluster)
+    (tmp_path / "eval.partial").mkdir()
+    (tmp_path / "eval.partial/notes.txt").touch()
+    for options in ({}, {"suite": "factors", "cells": "push"}):
+        with pytest.raises(FileExistsError, match=r"eval\.partial exists and is no"):
+            play(policy, tmp_path / "eval", **cluster, **options)
+    assert not slurm.jobs
+    with pytest.raises(ValueError, match="shards need --output_dir"):
+        eval_command(EvalConfig(PolicySource(str(policy)), seed=SEED, shards=2, shard=0))
 
 
 def test_options_that_do_nothing_together_are_refused(policy: Path, tmp_path: Path) -> None:

@@ -70,6 +70,29 @@ def test_nearest_is_in_deviations_and_among_what_was_learned(metadata: LeRobotDa
     assert from_runs(policy.config.training_data[0].episodes) == [0, 2, 3]
 
 
+def test_a_number_that_hardly_varies_does_not_drown_the_others(metadata: LeRobotDatasetMetadata) -> None:
+    """Forty demonstrations, and a quaternion's w that is 1 but for rounding: each is the nearest to itself."""
+    policy = learned(metadata, [0])
+    rng = torch.Generator().manual_seed(3)
+    starts = 0.1 * torch.randn(40, policy.starts.shape[1], generator=rng)
+    starts[:, 7] = 1.0 + 2e-6 * torch.randn(40, generator=rng)
+    policy.starts, policy.learned = starts, torch.ones(40, dtype=torch.bool)
+    assert policy.nearest(starts).tolist() == list(range(40))
+    seen = starts + 0.02 * torch.randn(starts.shape, generator=rng)
+    seen[:, 7] = starts[:, 7].flip(0)
+    others = [i for i in range(starts.shape[1]) if i != 7]
+    spread = starts[:, others].double().std(0, correction=0)
+    apart = ((seen[:, None, others] - starts[:, others]).double() / spread).norm(dim=-1)
+    assert policy.nearest(seen).tolist() == apart.argmin(-1).tolist()
+
+
+def test_other_demonstrations_are_refused(metadata: LeRobotDatasetMetadata, varied: LeRobotDatasetMetadata) -> None:
+    config = learned(metadata, [0]).config
+    NearestPolicy(config, dataset_meta=metadata)
+    with pytest.raises(ValueError, match="train it anew on other ones"):
+        NearestPolicy(config, dataset_meta=varied)
+
+
 def test_evaluation_mode_learns_nothing(metadata: LeRobotDatasetMetadata) -> None:
     policy = learned(metadata, [0])
     policy.forward({"index": torch.tensor([FRAMES])})

@@ -21,12 +21,16 @@ if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 
+_LEAST_SPREAD = 1e-3
+"""m, or units of a quaternion's numbers: what varies less counts as if it varied by so much, because that is noise."""
+
+
 class NearestPolicy(PreTrainedPolicy):
     """Replays the demonstration whose first state is nearest to the one that is seen at the start of an episode.
 
     The distance is Euclidean in the numbers of ``observation.state`` and ``observation.environment_state``, each divided by its
-    standard deviation over the demonstrations' first states; numbers that are the same in all of them do not count. After its
-    last action a demonstration stays there.
+    standard deviation over the demonstrations' first states, or by 0.001 where that is less. After its last action a
+    demonstration stays there.
 
     Args:
         config: see :class:`NearestConfig`.
@@ -48,6 +52,8 @@ class NearestPolicy(PreTrainedPolicy):
         self._demonstrations: Demonstrations | None = None
         if dataset_meta is not None:
             data = Demonstrations(dataset_meta, config.subtask_key, config.device or "cpu")
+            if any(record.digest != data.digest for record in config.training_data):
+                raise ValueError("nearest replays the demonstrations that it has: train it anew on other ones")
             config.episodes, config.longest = len(data.episode_index), data.longest_episode
             self._demonstrations = data
             self._learned = LearnedEpisodes(data, read_origin(dataset_meta, data.digest), config.training_data)
@@ -106,10 +112,10 @@ class NearestPolicy(PreTrainedPolicy):
         if not self.learned.any():
             raise RuntimeError("this policy has learned nothing yet: train it with lerobot-train")
         known = self.starts[self.learned]
-        spread = known.std(0, correction=0)
-        scale = torch.where(spread > 1e-6, 1.0 / spread, 0.0)
-        best = torch.cdist(state * scale, known * scale).argmin(-1)
-        return self.learned.nonzero().flatten()[best]
+        scale = known.std(0, correction=0).clamp_min(_LEAST_SPREAD)
+        # Not torch.cdist, which multiplies large matrices: numbers that hardly vary would cancel.
+        apart = ((state[:, None] - known) / scale).square().sum(-1)
+        return self.learned.nonzero().flatten()[apart.argmin(-1)]
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
