@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hdril.files import BusyError, exclusively, write_atomically
+from hdril.files import BusyError, exclusively, is_busy, write_atomically
 
 
 def test_a_file_appears_whole(tmp_path: Path) -> None:
@@ -55,3 +55,14 @@ def test_others_may_read_what_was_written_as_far_as_the_user_lets_them(tmp_path:
     (tmp_path / "plain").write_text("as any program writes")
     write_atomically(tmp_path / "whole", lambda file: file.write(b"x"))
     assert (tmp_path / "whole").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_whether_somebody_is_in_there(tmp_path: Path) -> None:
+    folder = tmp_path / "folder"
+    assert not is_busy(folder)
+    assert not folder.exists(), "looking makes nothing"
+    with exclusively(folder, "working"):
+        assert is_busy(folder)
+    assert not is_busy(folder)
+    with exclusively(folder, "working"):  # looking did not keep the lock
+        pass
