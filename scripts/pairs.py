@@ -25,7 +25,9 @@ class PValue:
 
 def summarise(results: Mapping[str, Any]) -> dict[str, Any]:
     """What a document keeps of ``results.json``. ``failed_seeds`` lets the report pair two policies seed by seed."""
-    kept = {key: value for key, value in results.items() if key not in ("per_episode", "policy", "comparison")}
+    # Without paths, which mean nothing on another machine.
+    left_out = ("per_episode", "policy", "policy_folder", "comparison")
+    kept = {key: value for key, value in results.items() if key not in left_out}
     return kept | {"failed_seeds": [episode["seed"] for episode in results["per_episode"] if not episode["success"]]}
 
 

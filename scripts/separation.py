@@ -77,7 +77,8 @@ def markdown(results: dict[str, Any]) -> str:
         rates = [row["pc_success"] for row in rows.values()]
         blocks += [
             f"## {task}",
-            f"Made on commit {entry['commit']}. From the weakest to the strongest: {max(rates) - min(rates):.1f} points.",
+            f"Made on commit {entry['commit']}."
+            + (f" From the weakest to the strongest: {max(rates) - min(rates):.1f} points." if others else ""),
             table(["model", "success", "p"], lines),
         ]
     return "\n\n".join(blocks) + "\n"

@@ -275,6 +275,7 @@ def test_presets_need_no_configuration_of_their_own(tmp_path: Path) -> None:
 def test_failed_seeds_are_kept_for_pairs(tmp_path: Path) -> None:
     results = summary(1, 2) | {
         "stages_reached": {}, "planner": {"pc_correct": 98.0}, "policy": "somewhere", "comparison": None,
+        "policy_folder": "/somewhere/else",
         "per_episode": [{"seed": 7, "success": False}, {"seed": 8, "success": True}],
     }  # fmt: skip
     (tmp_path / "results.json").write_text(json.dumps(results))
@@ -282,3 +283,4 @@ def test_failed_seeds_are_kept_for_pairs(tmp_path: Path) -> None:
         assert kept["failed_seeds"] == [7]
         assert "per_episode" not in kept
         assert "policy" not in kept
+        assert "policy_folder" not in kept, "a path of one machine"
