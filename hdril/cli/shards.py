@@ -50,12 +50,11 @@ def check_shards(options: PlayOptions, push: bool) -> None:
         ValueError: an option is out of range, or acts on nothing beside the others.
         UserError: what the executor needs is not installed.
     """
+    if options.shard is not None and options.executor != "local":
+        raise ValueError(f"--shard plays here: leave out --executor={options.executor}")
     check_execution(options.executor, options.shards, options.slurm)
-    if options.shard is not None:
-        if options.executor != "local":
-            raise ValueError(f"--shard plays here: leave out --executor={options.executor}")
-        if not 0 <= options.shard < options.shards:
-            raise ValueError(f"shard must be from 0 to {options.shards - 1}, got {options.shard}")
+    if options.shard is not None and not 0 <= options.shard < options.shards:
+        raise ValueError(f"shard must be from 0 to {options.shards - 1}, got {options.shard}")
     if options.executor != "slurm" and options.slurm != SlurmConfig():
         raise ValueError("--slurm.* is for --executor=slurm")
     if push and (options.shard is not None or options.executor == "slurm"):
