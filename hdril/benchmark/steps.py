@@ -14,7 +14,7 @@ import yaml
 
 from hdril.demonstrations.provenance import read_provenance
 from hdril.digest import digest_file, digest_files, digest_json
-from hdril.evaluation.checkpoint import Checkpoint
+from hdril.evaluation.checkpoint import Checkpoint, read_json
 from hdril.evaluation.held_out import STATISTICS
 from hdril.evaluation.overrides import ELSEWHERE
 from hdril.evaluation.software import (
@@ -94,10 +94,8 @@ class Record(Step):
         provenance = read_provenance(output)
         if provenance is None or not provenance.digest:
             raise ValueError(f"{output} is no dataset of hdril with a digest")
-        # Policies learn from the statistics, too.
-        return digest_json(
-            [provenance.digest, *(digest_file(output / name) for name in ("meta/info.json", STATISTICS))]
-        )
+        # Policies learn from the statistics, too. The order of their columns means nothing.
+        return digest_json([provenance.digest, *(read_json(output / name) for name in ("meta/info.json", STATISTICS))])
 
 
 @dataclass(frozen=True)

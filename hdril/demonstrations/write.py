@@ -56,6 +56,7 @@ def write_dataset(
     metadata.save_episode_tasks([task.description])
     digests, frames = _write_episodes(metadata, task, episodes)
     metadata.finalize()
+    _sort_statistics(root)
     _write_names(root, task, frames)
     provenance = replace(provenance, digest=dataset_digest(digests))
     write_provenance(root, provenance)
@@ -123,6 +124,14 @@ class _DataFiles:
             self._writer.close()
             self._sink.close()
         self._writer = self._sink = None
+
+
+def _sort_statistics(root: Path) -> None:
+    """LeRobot writes the columns in an order that is another one in each process; the same dataset is to be the same bytes."""
+    from lerobot.datasets.utils import STATS_PATH
+
+    path = root / STATS_PATH
+    path.write_text(json.dumps(json.loads(path.read_text()), indent=4, sort_keys=True))
 
 
 def _write_names(root: Path, task: Task, frames: NDArray[np.int64]) -> None:

@@ -298,7 +298,11 @@ def test_what_a_recording_made_is_episodes_and_statistics(dataset: Path, tmp_pat
     first = record.digest(copied)
     assert first == record.digest(dataset)
     statistics = copied / "meta/stats.json"
-    statistics.write_text(statistics.read_text() + "\n")
+    values = json.loads(statistics.read_text())
+    statistics.write_text(json.dumps(dict(reversed(values.items()))))
+    assert record.digest(copied) == first, "the order of columns means nothing"
+    values["action"]["mean"][0] += 1.0
+    statistics.write_text(json.dumps(values))
     assert record.digest(copied) != first
     (copied / "meta/hdril.json").unlink()
     with pytest.raises(ValueError, match="is no dataset of hdril with a digest"):

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -20,6 +23,7 @@ from hdril.simulation.actions import ACTION_NAMES, hand_poses
 from hdril.simulation.robots import SIDES
 from hdril.tasks import TASKS
 from hdril.tasks.scenario import Scenario
+from tests.evaluation.checkpoints import listing
 
 Written = tuple[Path, list[Episode]]
 
@@ -86,6 +90,19 @@ def test_files_are_closed_when_they_are_full(made_up: Callable[..., Episode], tm
     np.testing.assert_array_equal(loaded[5 * frames + 3]["action"].numpy(), made_up(5, frames).action[3])
     whole = write_dataset(tmp_path / "whole", provenance, [made_up(seed, frames) for seed in range(count)])
     assert whole.digest == made.digest
+
+
+def test_the_same_episodes_are_the_same_bytes_in_any_process(tmp_path: Path) -> None:
+    """LeRobot keeps names of columns in sets, whose order is another one in each process."""
+    program = (
+        "import sys; from pathlib import Path; from hdril.demonstrations.record import record;"
+        "from hdril.demonstrations.provenance import Recipe; record(Recipe('table_lift'), 1, 5, Path(sys.argv[1]))"
+    )
+    for seed in ("1", "2"):
+        variables = os.environ | {"PYTHONHASHSEED": seed}
+        command = [sys.executable, "-c", program, str(tmp_path / seed)]
+        subprocess.run(command, check=True, env=variables, capture_output=True)
+    assert listing(tmp_path / "1") == listing(tmp_path / "2")
 
 
 def test_segments_go_from_start_to_start_ends_included(written: Written) -> None:
