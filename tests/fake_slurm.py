@@ -1,9 +1,10 @@
-"""A Slurm that keeps what is submitted, and runs it when the test says so, one job after the other."""
+"""Slurm in tests: one that keeps what is submitted and runs it when the test says so, and the real one if there is any."""
 
 from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,3 +69,13 @@ class FakeSlurm:
         """What was submitted, in order."""
         files = sorted(self._kept.glob("*.slurm"), key=lambda file: int(file.stem))
         return [Job(file.read_text(), file.with_suffix(".arguments").read_text()) for file in files]
+
+
+def real_partition() -> str:
+    """A partition of the Slurm that this machine belongs to; skips the test if there is none that answers."""
+    if shutil.which("sinfo") is None:
+        pytest.skip("there is no Slurm here")
+    listed = subprocess.run(["sinfo", "-h", "-o", "%R"], capture_output=True, text=True, check=False)
+    if listed.returncode or not listed.stdout.split():
+        pytest.skip("there is no Slurm here that answers")
+    return listed.stdout.split()[0]

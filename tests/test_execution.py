@@ -17,7 +17,7 @@ from hdril.demonstrations.record import partial_folder, record, record_shard
 from hdril.demonstrations.shards import Shards
 from hdril.errors import UserError
 from hdril.execution import SlurmConfig, check_execution, run_on_ray, share
-from tests.fake_slurm import FakeSlurm
+from tests.fake_slurm import FakeSlurm, real_partition
 
 COUNT = 5
 RECIPE = Recipe("table_lift")
@@ -178,12 +178,8 @@ def test_ray_says_which_shards_failed(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.skipif(shutil.which("sinfo") is None, reason="there is no Slurm here")
 def test_slurm_makes_the_same_dataset(alone: Provenance, tmp_path: Path) -> None:
-    listed = subprocess.run(["sinfo", "-h", "-o", "%R"], capture_output=True, text=True, check=False)
-    if listed.returncode or not listed.stdout.split():
-        pytest.skip("there is no Slurm here that answers")
-    root, partition = tmp_path / "set", listed.stdout.split()[0]
+    root, partition = tmp_path / "set", real_partition()
     said = _record(root, "--executor=slurm", "--shards=3", f"--slurm.partition={partition}", "--slurm.mem_per_cpu_gb=1")
     assert "Submitted 3 shards as job " in said
     waiting = time.monotonic() + 300

@@ -112,7 +112,7 @@ class Engine:
         busy = {entry.step for entry in self._running}
         for step in left:
             if step in busy or (done := self._store.find(step)) is None:
-                if step in self._failed or any(other in self._failed for other in in_order([step])):
+                if any(other in self._failed for other in in_order([step])):
                     progress.left[step.kind] -= 1
                 else:
                     still.append(step)

@@ -57,7 +57,7 @@ def perform(assignment: Assignment) -> int:
 
     Raises:
         BusyError: another process does it.
-        OSError, ValueError: the command succeeded, but its result is not whole.
+        OSError, ValueError: the command succeeded, but its result is not whole; or what decides it was edited meanwhile.
     """
     step, place = assignment.step, assignment.place
     with exclusively(place, f"doing {step.title}"):
@@ -79,7 +79,10 @@ def perform(assignment: Assignment) -> int:
 
 
 def _check_unchanged(assignment: Assignment) -> None:
-    """Raises ValueError if what decides the result is not what it was when the benchmark began: a file was edited."""
+    """Raises ValueError if what decides the result is not what it was when the benchmark began: a file was edited.
+
+    Sources are looked at once in this process, when they are loaded anyway; config files each time.
+    """
     now, then = assignment.step.settings(), assignment.made_from["settings"]
     if digest_json(now) != digest_json(then):
         changed = ", ".join(sorted(key for key in then if digest_json(now.get(key)) != digest_json(then[key])))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from itertools import product
 from typing import Any
@@ -22,7 +21,7 @@ from hdril.evaluation.statistics import (
     paired_counts,
     paired_difference_interval,
 )
-from hdril.evaluation.stored import RESULTS
+from hdril.evaluation.stored import read_evaluation
 
 _KEPT = ("n_episodes", "n_success", "pc_success", "pc_success_ci95", "held_out", "position_error_cm", "angle_error_rad",
          "dtw_cm", "stages_reached")  # fmt: skip
@@ -75,7 +74,7 @@ def _row(row: Row, store: Store) -> dict[str, Any]:
 def _run(step: Evaluate, store: Store) -> dict[str, Any]:
     """One evaluation: its numbers, what was evaluated, and the command. ``failed_seeds`` lets a reader pair two policies."""
     done = store.get(step)
-    results = json.loads((done.output / RESULTS).read_text())
+    results = read_evaluation(done.output).results
     if [episode["seed"] for episode in results["per_episode"]] != list(step.seeds):
         raise ValueError(f"{done.output} holds other seeds than {step.title} asks for")
     return {key: results[key] for key in _KEPT} | {

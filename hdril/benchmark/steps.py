@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -225,5 +224,5 @@ class Evaluate(Step):
                 *self.options, f"--output_dir={output}"]  # fmt: skip
 
     def digest(self, output: Path) -> str:
-        json.loads((output / RESULTS).read_text())
+        read_json(output / RESULTS)  # it is whole
         return digest_file(output / RESULTS)

@@ -26,7 +26,8 @@ def _is_scrap(name: str) -> bool:
 
 
 class UnfinishedFolder:
-    """The folder ``<output>.partial``, which :meth:`finish` renames to ``output``. Nothing is written before :meth:`writing`.
+    """The folder ``<output>.partial``, which :meth:`finish` renames to ``output``. Nothing is written before :meth:`writing` or
+    :meth:`begin_share`.
 
     Args:
         output: where the results will be.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
 import time
@@ -22,7 +21,7 @@ from hdril.execution import SlurmConfig
 from hdril.files import BusyError
 from tests.evaluation.checkpoints import experts_episode, listing, save_hdril, save_replay
 from tests.evaluation.synthetic import outcome
-from tests.fake_slurm import FakeSlurm
+from tests.fake_slurm import FakeSlurm, real_partition
 
 SEED, COUNT = 930_000, 3
 
@@ -270,13 +269,9 @@ def test_ray_gives_the_same_results(untrained: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.skipif(shutil.which("sinfo") is None, reason="there is no Slurm here")
 def test_slurm_gives_the_same_results(untrained: Path, tmp_path: Path) -> None:
-    listed = subprocess.run(["sinfo", "-h", "-o", "%R"], capture_output=True, text=True, check=False)
-    if listed.returncode or not listed.stdout.split():
-        pytest.skip("there is no Slurm here that answers")
+    output, partition = tmp_path / "eval", real_partition()
     command(untrained, tmp_path / "alone")
-    output, partition = tmp_path / "eval", listed.stdout.split()[0]
     said = command(untrained, output, "--executor=slurm", "--shards=3", f"--slurm.partition={partition}")
     assert "Submitted 3 shards as job " in said
     waiting = time.monotonic() + 300

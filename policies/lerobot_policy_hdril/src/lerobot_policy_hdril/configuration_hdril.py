@@ -15,6 +15,7 @@ from lerobot_policy_hdril.graph import feature_names
 from lerobot_policy_hdril.presets import PRESETS
 from lerobot_policy_hdril.provenance import TrainingData
 from lerobot_policy_hdril.schema import LANGUAGE, SUBTASK_KEY
+from lerobot_policy_hdril.single_frames import SingleFrameConfig
 
 Interaction = Literal["none", "scalar", "object"]
 Decoder = Literal["gru", "ode", "linear"]
@@ -32,7 +33,7 @@ def _check_choice(name: str, value: str, choices: Any) -> None:
 
 @PreTrainedConfig.register_subclass("hdril")
 @dataclass
-class HDRILConfig(PreTrainedConfig):
+class HDRILConfig(SingleFrameConfig):
     """HDR-IL: a planner over primitives, and a graph-recurrent dynamics model for each (paper, Sections 4.1 to 4.3).
 
     The paper's models are values: GRU-GRU is ``interaction=none skip=false per_primitive=false``; Res adds ``skip``;
@@ -299,17 +300,3 @@ class HDRILConfig(PreTrainedConfig):
             peak_lr=self.optimizer_lr,
             decay_lr=self.scheduler_final_lr,
         )
-
-    # The loader yields single frames, and the policy looks up the rest of each trajectory in memory: windows through
-    # the loader are 50 times slower (see demonstrations.py).
-    @property
-    def observation_delta_indices(self) -> None:
-        return None
-
-    @property
-    def action_delta_indices(self) -> None:
-        return None
-
-    @property
-    def reward_delta_indices(self) -> None:
-        return None

@@ -11,11 +11,12 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from lerobot_policy_hdril.provenance import TrainingData
 from lerobot_policy_hdril.schema import SUBTASK_KEY
+from lerobot_policy_hdril.single_frames import SingleFrameConfig
 
 
 @PreTrainedConfig.register_subclass("nearest")
 @dataclass
-class NearestConfig(PreTrainedConfig):
+class NearestConfig(SingleFrameConfig):
     """A baseline that learns nothing: the demonstration whose first state is nearest is replayed, blindly, to its end.
 
     With few demonstrations retrieval is hard to beat; see Pari et al. (2022), "The Surprising Effectiveness of Representation
@@ -51,16 +52,4 @@ class NearestConfig(PreTrainedConfig):
         return SGDConfig(lr=0.0, weight_decay=0.0)
 
     def get_scheduler_preset(self) -> None:
-        return None
-
-    @property
-    def observation_delta_indices(self) -> None:
-        return None
-
-    @property
-    def action_delta_indices(self) -> None:
-        return None
-
-    @property
-    def reward_delta_indices(self) -> None:
         return None
