@@ -132,8 +132,9 @@ def _grip(sign: float) -> Grip:
 
     Where the table stands nearly square, the hand is pitched down by 45 degrees. It is steeper at a handle that is turned
     towards the robot, which is too near for a flat hand. At one that is turned away and far aside, the jaws must point another
-    way than the forearm: the hand is steeper there too, and turned outwards as far as the jaws' width allows. Where the platform
-    is far, the hand takes the end of the handle that is nearer to the robot.
+    way than the forearm: the hand is steeper there too, and turned outwards. Where the handle is turned away most, it is turned
+    further outwards, as far as the jaws' width allows, and flatter: so it reaches furthest. There, and where the platform is far,
+    it takes the end of the handle that is nearer to the robot.
     """
 
     def pose(scene: Scene) -> Pose:
@@ -142,12 +143,13 @@ def _grip(sign: float) -> Grip:
         aside = sign * (table @ Pose((0.0, y, GRIP_HEIGHT))).position[1]
         near = 30.0 * _ramp(yaw, 3.0, 10.0) + 5.0 * _ramp(yaw, 18.0, 28.0)
         away = _ramp(-yaw, 6.0, 11.0) * _ramp(aside, 0.36, 0.44)
-        nearer = max(0.02 * away, 0.02 * _far(scene))
+        farthest = away * _ramp(-yaw, 18.0, 30.0)
+        nearer = max(0.02 * away + 0.01 * farthest, 0.02 * _far(scene))
         grip = Pose((-nearer, y, GRIP_HEIGHT), _PITCH)
         if away:
-            outwards = Pose((0, 0, 0), about_z(sign * math.radians(20.0 * away)))
+            outwards = Pose((0, 0, 0), about_z(sign * math.radians(20.0 * (away + farthest))))
             grip = Pose(grip.position, (outwards @ grip).quaternion)
-        return grip @ _turned(near + 13.0 * away) if near or away else grip
+        return grip @ _turned(near + 13.0 * (away - farthest)) if near or away else grip
 
     return Grip("table", pose)
 

@@ -77,11 +77,16 @@ def test_a_handle_that_is_turned_towards_the_robot_is_gripped_more_steeply_and_s
 @pytest.mark.parametrize("side", SIDES)
 def test_a_handle_that_is_turned_away_and_far_aside_is_gripped_from_within(side: str) -> None:
     sign = SIGNS[side]
-    turned = scene(yaw=-25.0 * sign, at=(0.5, 0.28 * sign, 0.0))
-    tool, table = GRIPS[side].tool(turned), turned.objects["table"]
-    assert pitch(tool) > 50.0
-    heading = (table.inverse() @ tool).rotation_matrix()[:2, 2]
-    assert sign * math.degrees(math.atan2(heading[1], heading[0])) == pytest.approx(20.0, abs=0.5)
+
+    def grip(yaw: float) -> tuple[float, float, float]:
+        """Its pitch and how far outwards it is turned, deg, and how far it is from the handle's middle, towards the robot, mm."""
+        turned = scene(yaw=-yaw * sign, at=(0.5, 0.28 * sign, 0.0))
+        tool = turned.objects["table"].inverse() @ GRIPS[side].tool(turned)
+        heading = tool.rotation_matrix()[:2, 2]
+        return pitch(tool), sign * math.degrees(math.atan2(heading[1], heading[0])), -1000.0 * tool.position[0]
+
+    assert grip(15.0) == pytest.approx((58.0, 20.0, 20.0), abs=0.5)
+    assert grip(30.0) == pytest.approx((45.0, 40.0, 30.0), abs=0.5)
     near = scene(yaw=-25.0 * sign, at=(0.5, -0.1 * sign, 0.0))
     assert pitch(GRIPS[side].tool(near)) == pytest.approx(45.0)
 
