@@ -24,7 +24,7 @@ from hdril.evaluation.statistics import (
 from hdril.evaluation.stored import read_evaluation
 
 _KEPT = ("n_episodes", "n_success", "pc_success", "pc_success_ci95", "held_out", "position_error_cm", "angle_error_rad",
-         "dtw_cm", "stages_reached")  # fmt: skip
+         "dtw_cm", "pc_expert_choice", "stages_reached")  # fmt: skip
 
 
 def collect(matrix: Matrix, store: Store) -> dict[str, Any]:

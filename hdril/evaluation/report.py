@@ -43,7 +43,7 @@ def markdown(summary: Mapping[str, Any], outcomes: Sequence[Outcome]) -> str:
     blocks = [
         *_introduction(summary),
         *_errors(summary),
-        *_order(summary["pc_expert_order"]),
+        *_order(summary),
         *_comparison(summary["comparison"]),
         *_planner(summary["planner"], get_task(summary["task"]).labels),
         *_events([o for o in outcomes if o.events or o.noticed], get_task(summary["task"]).physics.control_period),
@@ -87,10 +87,13 @@ def _spread(value: Mapping[str, float], digits: int) -> str:
     return f"{value['mean']:.{digits}f} ± {value['std']:.{digits}f}"
 
 
-def _order(share: float | None) -> list[str]:
-    return (
-        [] if share is None else [f"The policy played the expert's order of primitives in {share:.1f} % of episodes."]
-    )
+def _order(summary: Mapping[str, Any]) -> list[str]:
+    if summary["pc_expert_order"] is None:
+        return []
+    return [
+        f"The policy began with the expert's primitive in {summary['pc_expert_choice']:.1f} % of episodes, and played "
+        f"the expert's order of primitives in {summary['pc_expert_order']:.1f} %."
+    ]
 
 
 def _comparison(comparison: Mapping[str, Any] | None) -> list[str]:

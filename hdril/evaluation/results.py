@@ -26,8 +26,9 @@ key                                   meaning
 ``position_error_cm_by_primitive``    spread by name of the expert's primitive, cm; without primitives that were not reached
 ``motion``                            spread of each number of :class:`hdril.evaluation.motion.Motion`, by name
 ``stages_reached``                    episodes by the last stage reached: a stage, ``none`` or ``success``
-``pc_expert_order``                   episodes in which the policy played the expert's order of primitives, % of those with
-                                      primitives; null for a policy without
+``pc_expert_order``                   episodes in which the policy played the primitives that the expert plays in this scene, in
+                                      its order, % of those with primitives; null for a policy without
+``pc_expert_choice``                  the same of the first primitive alone, which is where the plan depends on the scene
 ``planner``                           null for a policy without a planner, or with primitives that are not the task's
 ``planner.pc_correct``                frames at which it prefers the expert's primitive, %
 ``planner.pc_correct_at_boundaries``  the same of the first frames of primitives alone, %
@@ -137,7 +138,8 @@ def summarise(run: Run, outcomes: Sequence[Outcome], comparison: Comparison | No
         "position_error_cm_by_primitive": _by_primitive(compared, get_task(run.task).labels),
         "motion": {name: _spread([outcome.motion[name] for outcome in outcomes]) for name in outcomes[0].motion},
         "stages_reached": dict(Counter(outcome.stage or "none" for outcome in outcomes)),
-        "pc_expert_order": _expert_order(outcomes, tuple(p.name for p in get_task(run.task).primitives)),
+        "pc_expert_order": _as_the_expert(outcomes),
+        "pc_expert_choice": _as_the_expert(outcomes, first=1),
         "planner": _planner(outcomes),
         "comparison": _compared(comparison) if comparison else None,
         "hdril_version": __version__,
@@ -167,10 +169,12 @@ def _by_primitive(outcomes: Sequence[Outcome], labels: tuple[str, ...]) -> dict[
     return {name: spread for name, spread in spreads.items() if spread is not None}
 
 
-def _expert_order(outcomes: Sequence[Outcome], script: tuple[str, ...]) -> float | None:
-    """Percentage of episodes in which a policy with primitives played ``script``; None without such a policy."""
-    planned = [outcome.primitives for outcome in outcomes if outcome.primitives]
-    return 100.0 * planned.count(script) / len(planned) if planned else None
+def _as_the_expert(outcomes: Sequence[Outcome], first: int | None = None) -> float | None:
+    """Percentage of episodes in which a policy with primitives played what the expert plays in the scene, or the ``first`` of it;
+    None without such a policy."""
+    planned = [outcome for outcome in outcomes if outcome.primitives]
+    same = [outcome.primitives[:first] == outcome.expert_primitives[:first] for outcome in planned]
+    return 100.0 * float(np.mean(same)) if planned else None
 
 
 def _planner(outcomes: Sequence[Outcome]) -> dict[str, Any] | None:

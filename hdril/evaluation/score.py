@@ -45,6 +45,8 @@ class Outcome:
     """x and y of every observed object at the start, m."""
     primitives: tuple[str, ...] = ()
     """What the policy played, in order; empty if it has no primitives."""
+    expert_primitives: tuple[str, ...] = ()
+    """What the expert plays in this scene, in order."""
     stage: str = ""
     """The last of the task's stages that was reached; empty if none was."""
     measures: dict[str, float] = field(default_factory=dict)
@@ -98,6 +100,7 @@ def score_episode(task: Task, seed: int, trace: Trace, reference: Reference, end
         position_error_cm_by_primitive=_error_by_primitive(error.position, reference.scripted, task.labels),
         start=_start(task, trace),
         primitives=_played(trace.executed, task.labels),
+        expert_primitives=_played(reference.scripted, task.labels),
         stage=("", *(stage.name for stage in task.stages), "success")[trace.stage[-1]],
         planner_confusion=confusion,
         planner_boundary_hits=hits,

@@ -85,6 +85,6 @@ def outcome(seed: int, **changes: Any) -> Outcome:
     good = Outcome(
         seed=seed, success=True, unmet="", frames=70, ik_failures=0, position_error_cm=0.2, angle_error_rad=0.002,
         dtw_cm=0.1, position_error_cm_by_primitive=dict.fromkeys(labels, 0.2), start=(0.6, 0.1), primitives=labels,
-        stage="success", planner_confusion=confusion, planner_boundary_hits=[True] * 6,
+        expert_primitives=labels, stage="success", planner_confusion=confusion, planner_boundary_hits=[True] * 6,
     )  # fmt: skip
     return replace(good, **changes)

@@ -103,11 +103,17 @@ def test_there_may_be_no_error_to_tell(tmp_path: Path) -> None:
 
 def test_the_experts_order_is_a_share_of_the_episodes_with_primitives() -> None:
     labels = get_task("table_lift").labels
-    outcomes = [outcome(0), outcome(1, primitives=("grasp", *labels)), outcome(2, primitives=()), outcome(3)]
-    assert summarise(RUN, outcomes)["pc_expert_order"] == pytest.approx(200 / 3)
-    assert "order of primitives in 66.7 % of episodes" in report(outcomes)
+    outcomes = [
+        outcome(0), outcome(1, primitives=("grasp", *labels)), outcome(2, primitives=()), outcome(3, primitives=labels[1:]),
+        outcome(4, primitives=labels[1:], expert_primitives=labels[1:]),
+    ]  # fmt: skip
+    data = summarise(RUN, outcomes)
+    assert (data["pc_expert_order"], data["pc_expert_choice"]) == (50.0, 75.0)
+    assert "began with the expert's primitive in 75.0 % of episodes" in report(outcomes)
+    assert "order of primitives in 50.0 %" in report(outcomes)
     without = [outcome(0, primitives=())]
-    assert summarise(RUN, without)["pc_expert_order"] is None
+    data = summarise(RUN, without)
+    assert data["pc_expert_order"] is data["pc_expert_choice"] is None
     assert "order of primitives" not in report(without)
 
 

@@ -124,6 +124,7 @@ def test_the_last_stage_and_the_last_measures_are_told(reached: int, name: str) 
 def test_a_primitive_is_listed_each_time_that_it_begins() -> None:
     played = [explanation(k) for k in (0, 1, 1, 0, 0, 2)]
     assert score(trace(explanations=played)).primitives == ("grasp", "move", "grasp", "lift")
+    assert score(trace(explanations=played)).expert_primitives == ("grasp", "move", "lift")
 
 
 def test_primitives_that_the_task_lacks_are_not_listed() -> None:
