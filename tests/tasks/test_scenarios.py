@@ -19,7 +19,9 @@ from hdril.rollout import transitions
 from hdril.simulation.robots import SIDES
 from hdril.tasks import LEVELS, TASKS, Task, get_task, task_parameters
 from hdril.tasks.events import EVENT_KINDS, Event
+from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.factors import COMMON, Factor
+from hdril.tasks.primitives import Noise
 from hdril.tasks.scenario import Scenario
 from tests.tasks.test_tasks import play
 
@@ -285,6 +287,27 @@ def test_an_event_goes_through_its_door_and_nothing_else_moves_anything(
     assert {name for _, name in calls} == ALLOWED | extra
     moved = {frame for frame, name in calls if name in extra}
     assert moved == (set(range(event.frame, event.frame + event.frames)) if extra else set())
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_what_happens_to_the_sensor_changes_nothing_of_what_the_expert_does(task: str) -> None:
+    """So that its success where scenes are seen badly is that of where they are seen well."""
+    varied = get_task(f"{task}:level=varied")
+    blind = tuple(spec.sample(3) for spec in varied.events if spec.kind in ("freeze", "repeat"))
+    seen_badly = replace(varied.sample(3), events=blind)
+    assert {event.kind for event in blind} == {"freeze", "repeat"}
+    perfect = {"position_noise": 0.0, "rotation_noise": 0.0, "delay": 0.0}
+    seen_well = replace(seen_badly, values=seen_badly.values | perfect, events=())
+    ends, observed = [], []
+    with closing(BimanualEnv(varied.name)) as env:
+        for scenario in (seen_badly, seen_well):
+            expert = ScriptedExpert(env.task_spec, Noise())
+            steps = list(transitions(env, expert, 3, scenario=scenario))
+            ends.append((len(steps), env.world.state_vector()))
+            observed.append(np.array([step.observation["environment_state"] for step in steps]))
+    assert ends[0][0] == ends[1][0]
+    np.testing.assert_array_equal(ends[0][1], ends[1][1])
+    assert not np.array_equal(*observed)
 
 
 def test_every_kind_of_event_is_used_by_a_task() -> None:
