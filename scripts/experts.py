@@ -75,9 +75,10 @@ def markdown(rows: dict[str, dict[str, dict[str, Any]]]) -> str:
         "# The scripted experts",
         "How often the expert of each task succeeds: on nominal scenes, where one factor varies over its range, where all do "
         "(`varied`), where one event happens to a nominal scene, and where all factors vary and something happens (`hard`). "
-        "Made by `python scripts/experts.py`. The expert has the noise of demonstrations. It sees exact poses and sizes: "
-        "noise and delay of the observation, and events that blind the sensor, change nothing of what it does (a test compares the "
-        "bits), and have no row. It does not know masses and friction. Intervals are Wilson's, 95 %. The seeds were used for nothing else.",
+        "Made by `python scripts/experts.py`. The expert has the noise of demonstrations. It sees exact poses and sizes: noise "
+        "and delay of the observation, and events that blind the sensor, change nothing of what it does (a test compares the "
+        "bits), and have no row. It does not know masses and friction. Intervals are Wilson's, 95 %. The seeds were used for "
+        "nothing else.",
     ]
     for task, known in rows.items():
         lines = [
