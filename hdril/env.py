@@ -18,7 +18,7 @@ from hdril.simulation.disturbances import Disturbances
 from hdril.simulation.robots import ROBOTS
 from hdril.simulation.sensor import Sensor
 from hdril.simulation.world import ROBOT, Physics, World
-from hdril.tasks import base_name, get_task
+from hdril.tasks import built_as, get_task
 from hdril.tasks.conditions import failed
 from hdril.tasks.events import EVENT_KINDS
 from hdril.tasks.factors import POSTURE, stream
@@ -125,14 +125,14 @@ class BimanualEnv(gym.Env):
         ``options={"scenario": …}`` plays a :class:`~hdril.tasks.scenario.Scenario` instead.
 
         Raises:
-            ValueError: the scenario is of another task.
+            ValueError: the scenario is of another task, or of this one with other parameters of its own.
         """
         super().reset(seed=seed)
         self.close()
         scenario = (options or {}).get("scenario")
         if scenario is None:
             scenario = self._declared.sample(int(self.np_random.integers(MAX_SEED + 1)) if seed is None else seed)
-        elif base_name(scenario.task) != base_name(self.task):
+        elif built_as(scenario.task) != built_as(self.task):
             raise ValueError(f"this is an environment of {self.task}, the scenario is of {scenario.task}")
         self.scenario: Scenario = scenario
         self.task_spec = self._declared.at(scenario.values)
@@ -178,19 +178,19 @@ class BimanualEnv(gym.Env):
         self.controller.apply(commands)
         self.frame += 1
         missing = self._missing(world)
-        success = not missing
+        success, fallen = not missing, self._fallen(world)
         info = {
             "is_success": success,
-            "unmet": ", ".join(missing),
+            "unmet": ", ".join((*missing, *(f"{name} has fallen off the bench" for name in fallen))) if missing else "",
             "events": events,
             "ik_failure": "; ".join(f"{side}: {why}" for side, why in self.controller.failures.items()),
         } | self._progress(success)
-        truncated = not success and (self.frame >= self._max_episode_steps or self._fallen(world))
+        truncated = not success and (self.frame >= self._max_episode_steps or bool(fallen))
         return self._observe(), float(success), success, truncated, info
 
-    def _fallen(self, world: World) -> bool:
-        """Whether an object has fallen off the bench, so that nothing can be done any more."""
-        return any(world.pose(name).position[2] < FALLEN for name in self.task_spec.observed)
+    def _fallen(self, world: World) -> tuple[str, ...]:
+        """Objects that have fallen off the bench, after which nothing can be done any more."""
+        return tuple(name for name in self.task_spec.observed if world.pose(name).position[2] < FALLEN)
 
     def _begin_events(self) -> str:
         """Let those events happen that begin at this frame; says which, in words."""

@@ -113,14 +113,35 @@ def task_parameters(name: str) -> dict[str, float]:
     values.setdefault(DETAILED, float(any(values[key] != nominal[key] for key in nominal)))
     for factor in task.all_factors:
         factor.check(values[factor.name])
-    for probability in (*(spec.name for spec in task.events), ANY_EVENT, DETAILED):
+    for probability in (*(spec.name for spec in task.events), ANY_EVENT):
         if not 0.0 <= values[probability] <= 1.0:
             raise ValueError(f"{probability} must be from 0 to 1, got {values[probability]:g}")
+    if values[DETAILED] not in (0.0, 1.0):
+        raise ValueError(f"{DETAILED} must be 0 or 1, got {values[DETAILED]:g}")
     return values
 
 
 def _settings(text: str) -> dict[str, str]:
-    return {key: value for key, _, value in (item.partition("=") for item in text.split(",") if item)}
+    """The texts by parameter.
+
+    Raises:
+        ValueError: a parameter is given twice.
+    """
+    items = [item.partition("=") for item in text.split(",") if item]
+    names = [key for key, _, _ in items]
+    if twice := [key for key in names if names.count(key) > 1]:
+        raise ValueError(f"{twice[0]} is given twice in {text!r}")
+    return {key: value for key, _, value in items}
+
+
+def built_as(name: str) -> tuple[str, dict[str, float]]:
+    """A task's name without parameters, and the parameters of its ``make_task``: what scenes of one task have in common.
+
+    Raises:
+        ValueError: as :func:`task_parameters`.
+    """
+    values, base = task_parameters(name), base_name(name)
+    return base, {parameter: values[parameter] for parameter in _builder(base)}
 
 
 def get_task(name: str) -> Task:
@@ -132,7 +153,7 @@ def get_task(name: str) -> Task:
     values, (base, _, settings) = task_parameters(name), name.partition(":")
     if not settings:
         return TASKS[base]
-    build = {parameter: values[parameter] for parameter in _builder(base)}
+    _, build = built_as(name)
     task = TASKS.source(base).make_task(**build) if build else TASKS[base]
     variation = Variation(
         {factor.name: values[factor.name] for factor in task.all_factors if values[factor.name] != factor.off},
@@ -142,4 +163,4 @@ def get_task(name: str) -> Task:
     return replace(task, name=name, variation=variation, detailed=bool(values[DETAILED]))
 
 
-__all__ = ["LEVELS", "TASKS", "Task", "Uniform", "base_name", "fixed", "get_task", "task_parameters"]
+__all__ = ["LEVELS", "TASKS", "Task", "Uniform", "base_name", "built_as", "fixed", "get_task", "task_parameters"]

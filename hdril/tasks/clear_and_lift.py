@@ -153,9 +153,16 @@ def admissible(poses: dict[str, Pose], values: Values) -> bool:
     return table_lift.admissible(poses, values) and beside
 
 
-def _left_alone(world: World) -> bool:
+def _put_aside(world: World) -> bool:
+    """Whether the canister is on the bench and nothing touches it. Behind the platform's front, the table has shoved it there."""
     others = ("table", "platform", ROBOT)
-    return bool(world.contacts("box", BENCH.name)) and not any(world.contacts("box", other) for other in others)
+    on_bench = world.contacts("box", BENCH.name) and not any(world.contacts("box", other) for other in others)
+    return bool(on_bench and before(world.pose("box"), world.pose("platform")))
+
+
+def before(box: Pose, platform: Pose) -> bool:
+    """Whether the canister's foot is on the robot's side of the platform's front."""
+    return bool(box.position[0] < platform.position[0] - PLATFORM_DEPTH / 2)
 
 
 def _where_it_stood(world: World) -> bool:
@@ -165,7 +172,7 @@ def _where_it_stood(world: World) -> bool:
     return bool(before.position[2] > 0.0 or (near and geodesic_distance(now.quaternion, before.quaternion) < 0.1))
 
 
-BOX_ASIDE = Condition("box on bench, free of all else", _left_alone)
+BOX_ASIDE = Condition("box on bench before the platform, free of all else", _put_aside)
 BOX_LEFT = Condition("box that stood aside left there", _where_it_stood)
 
 # ---------------------------------------------------------------------- what is seen
@@ -178,8 +185,8 @@ def lowest(box: Pose) -> float:
 
 
 def aside(scene: Scene) -> bool:
-    """Whether the canister is on the bench."""
-    return lowest(scene.objects["box"]) < 0.03
+    """Whether the canister is on the bench, before the platform."""
+    return lowest(scene.objects["box"]) < 0.03 and before(scene.objects["box"], scene.objects["platform"])
 
 
 def holds_box(scene: Scene, side: str) -> bool:

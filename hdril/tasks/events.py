@@ -70,6 +70,10 @@ class EventSpec:
 
     ``window`` and ``frames`` are ranges of whole frames, both ends included. ``strength`` is a range in the kind's unit; the
     direction is uniform in the horizontal plane.
+
+    Raises:
+        ValueError: an unknown kind, a range that ends before it begins, or a strength where the kind has none or none where it
+            has one.
     """
 
     name: str
@@ -80,7 +84,16 @@ class EventSpec:
     strength: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        EVENT_KINDS.find(self.kind)
+        needs_strength = bool(EVENT_KINDS.find(self.kind).unit)
+        if needs_strength != (self.strength is not None):
+            raise ValueError(
+                f"event {self.name}: a {self.kind} {'needs a strength' if needs_strength else 'has no strength'}"
+            )
+        for what, (low, high), least in (("window", self.window, 0), ("frames", self.frames, 1)):
+            if not least <= low <= high:
+                raise ValueError(
+                    f"event {self.name}: {what} must be from {least} on and not end before it begins, got {low} to {high}"
+                )
 
     def sample(self, seed: int) -> Event:
         """The event in the episode of a seed."""

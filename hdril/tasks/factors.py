@@ -65,11 +65,13 @@ class Factor:
         """The range, if it is one.
 
         Raises:
-            ValueError: it is not between :attr:`off` and :attr:`limit`.
+            ValueError: it is not between :attr:`off` and :attr:`limit`, or is a part of a frame.
         """
         if not self.off <= span <= self.limit:
             unit = f" {self.unit}" if self.unit else ""
             raise ValueError(f"{self.name} must be from {self.off:g} to {self.limit:g}{unit}, got {span:g}")
+        if self.unit == "frames" and span != round(span):
+            raise ValueError(f"{self.name} must be a whole number of frames, got {span:g}")
         return span
 
     def draw(self, span: float, seed: int, attempt: int = 0) -> dict[str, float]:

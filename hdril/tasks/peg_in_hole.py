@@ -47,7 +47,8 @@ FACTORS = (
 )  # fmt: skip
 EVENTS = (
     EventSpec("push", "push", (1, 18), HALVES, strength=(0.4, 1.25)),
-    EventSpec("push_held", "push", (20, 124), HALVES, strength=(0.4, 1.25)),
+    # From where both halves are in the hands: before that, one of them stands alone.
+    EventSpec("push_held", "push", (101, 124), HALVES, strength=(0.4, 1.25)),
     EventSpec("open_hand", "open_hand", (16, 124), SIDES, frames=(3, 6)),
     EventSpec("stop_motor", "stop_motor", (2, 124), ARM_JOINTS, frames=(5, 10)),
     EventSpec("freeze", "freeze", (0, 124), frames=(5, 15)),

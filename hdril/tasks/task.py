@@ -82,9 +82,10 @@ class Task:
     this order. Success is judged from frame ``horizon`` on, when the primitives are over. ``measures`` and ``stages`` are
     logged at every frame, to show how far a failed episode came. Success itself is the last stage and is not listed.
 
-    Where scenes vary, the task says by ``factors`` what may vary, and ``vary`` gives the task as it is for some values of them:
-    with other bodies, placements, primitives and conditions. ``also_observed`` and ``attributes`` are observed beside
-    ``observed`` then, because they differ from scene to scene.
+    Where scenes vary, the task says by ``factors`` what may vary, and ``vary`` gives the task as it is for some values of
+    them: with other bodies, placements and conditions. The primitives are the same: what differs in them is a function of the
+    scene. ``also_observed`` and ``attributes`` are observed beside ``observed`` then, because they differ from scene to
+    scene.
     """
 
     name: str
@@ -132,6 +133,17 @@ class Task:
                 raise ValueError(f"task {self.name}: no body {name!r}; bodies: {', '.join(names)}")
         if missing := set(names) - set(self.placements):
             raise ValueError(f"task {self.name}: no placement for {', '.join(sorted(missing))}")
+        targets = {
+            "push": [body.name for body in self.bodies if body.mass > 0.0],
+            "slide": [body.name for body in self.bodies if body.mass == 0.0],
+            "open_hand": list(SIDES),
+        }
+        for event in self.events:
+            valid = targets.get(event.kind, event.targets)
+            if wrong := [target for target in event.targets if target not in valid]:
+                raise ValueError(
+                    f"task {self.name}: {event.name} cannot happen to {wrong[0]!r}; choose from: {', '.join(valid)}"
+                )
 
     @property
     def gym_id(self) -> str:
