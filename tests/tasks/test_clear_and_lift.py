@@ -14,7 +14,7 @@ from hdril.geometry import Pose
 from hdril.rollout import transitions
 from hdril.simulation.world import World
 from hdril.tasks import get_task
-from hdril.tasks.clear_and_lift import ASIDE, BOX_ASIDE, CLEARANCE, EDGE, lowest
+from hdril.tasks.clear_and_lift import ASIDE, ASIDE_NEED, BOX_ASIDE, CLEARANCE, EDGE, lowest
 from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.primitives import Noise
 from hdril.tasks.scenario import Scenario
@@ -33,17 +33,28 @@ def where(scenario: Scenario) -> tuple[str, str]:
 
 
 @cache
+def seeds_of(place: str, side: str, level: str = "nominal") -> list[int]:
+    """Seeds whose scenes have the canister there."""
+    task = get_task(f"{NAME}:level={level}")
+    return [seed for seed in range(980_000, 980_200) if where(task.sample(seed)) == (place, side)]
+
+
 def seed_of(place: str, side: str) -> int:
     """A seed whose scene has the canister there."""
-    return next(seed for seed in range(980_000, 981_000) if where(TASK.sample(seed)) == (place, side))
+    return seeds_of(place, side)[0]
 
 
-def play(seed: int, script: tuple[str, ...] = TASK.labels) -> tuple[dict, list[str], BimanualEnv]:
+def play(
+    seed: int, script: tuple[str, ...] = TASK.labels, level: str = "nominal", max_episode_steps: int | None = None
+) -> tuple[dict, list[str], BimanualEnv]:
     """The last info of an episode, the primitives that were begun, and the world as it ends; of an expert that knows
     the primitives in ``script`` alone."""
-    env = BimanualEnv(NAME)
-    chosen = tuple(p.needing() if script == TABLE_LIFT else p for p in TASK.primitives if p.name in script)
-    expert, begun, info = ScriptedExpert(replace(TASK, primitives=chosen), Noise(0.0)), [], {}
+    env = BimanualEnv(f"{NAME}:level={level}", max_episode_steps=max_episode_steps)
+    chosen = tuple(
+        p.needing(*(need for need in p.needs if need is not ASIDE_NEED)) if script == TABLE_LIFT else p
+        for p in env.task_spec.primitives if p.name in script
+    )  # fmt: skip
+    expert, begun, info = ScriptedExpert(replace(env.task_spec, primitives=chosen), Noise(0.0)), [], {}
     for transition in transitions(env, expert, seed):
         info, explanation = transition.info, transition.decision.explanation
         if explanation is not None and explanation.starts:
@@ -106,14 +117,15 @@ def test_a_canister_that_stands_aside_is_left_alone(side: str) -> None:
         assert env.world.pose("box").position == pytest.approx(drawn, abs=2e-3)
 
 
+@pytest.mark.parametrize("level", ["nominal", "varied"])
 @pytest.mark.parametrize(("place", "side"), PLACES)
-def test_a_planner_that_skips_the_step_fails(place: str, side: str) -> None:
-    """The canister stays on the table, or the table shoves it over the platform or off the bench."""
-    info, begun, env = play(seed_of(place, side), TABLE_LIFT)
-    with closing(env):
-        assert begun[: len(TABLE_LIFT)] == list(TABLE_LIFT)
-        assert not info["is_success"]
-        assert not BOX_ASIDE.holds(env.world)
+def test_a_planner_that_skips_the_step_fails(place: str, side: str, level: str) -> None:
+    """The canister stays on the table, or the table shoves it over the platform, or behind it, or off the bench."""
+    for seed in seeds_of(place, side, level)[: 4 if level == "nominal" else 2]:
+        info, begun, env = play(seed, TABLE_LIFT, level, max_episode_steps=TASK.horizon + 30)
+        with closing(env):
+            assert set(begun) <= set(TABLE_LIFT)
+            assert not info["is_success"], seed
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
@@ -139,11 +151,12 @@ def test_lowest_corner(turned: tuple[float, ...], expected: float) -> None:
 
 
 def test_a_canister_counts_as_aside_on_the_bench_alone() -> None:
-    """Standing against the platform or hanging in the air is not aside."""
+    """Standing against the platform, hanging in the air or lying behind the platform is not aside."""
     spec = {body.name: body for body in TASK.bodies}
     for box, expected in [
         ((0.5, 0.82, 0.0), True),
         ((0.5, 0.82, 0.2), False),
+        ((1.20, 0.0, 0.0), False),
         ((0.98 - 0.15 - EDGE / 2 + 0.0005, 0.0, 0.0), False),
         ((0.98, 0.0, 0.12), False),
     ]:

@@ -150,7 +150,7 @@ def successful(task: str) -> Disturbed:
     return Disturbed(env, trace.joints)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", [*TASKS, *(f"{task}:level=varied" for task in TASKS), "handover:upright=1"])
 def test_an_episode_fails_by_each_success_condition_alone(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """For each condition there is a world in which it alone fails; the environment judges it a failure and says which."""
     disturbed = successful(task)

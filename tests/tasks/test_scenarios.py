@@ -173,25 +173,55 @@ def test_same_seed_same_episode_bit_for_bit_in_another_process(name: str) -> Non
     assert printed.split()[-1] == hashlib.sha256(first.tobytes()).hexdigest()
 
 
-@pytest.mark.parametrize("idle", SIDES)
+def easiest_for_one_arm(task: Task, seed: int) -> Scenario:
+    """The scene of a seed with everything as light and as rough as it may be."""
+    spans = task.variation.spans
+    lightest = {key: 1.0 / spans[f.name] for f in task.factors if f.kind == "ratio" for key in f.keys}
+    roughest = {key: 1.0 + spans[f.name] for f in task.factors if f.name == "friction" for key in f.keys}
+    scenario = task.sample(seed)
+    assert lightest
+    assert roughest
+    assert set(lightest | roughest) <= set(scenario.values)
+    return replace(scenario, values=scenario.values | lightest | roughest)
+
+
 @pytest.mark.parametrize("task", TASKS)
-def test_one_arm_fails_where_scenes_vary(task: str, idle: str) -> None:
-    env = BimanualEnv(f"{task}:level=varied")
-    with closing(env):
+def test_each_arm_is_needed_where_scenes_vary(task: str) -> None:
+    with closing(BimanualEnv(f"{task}:level=varied")) as env:
         for seed in range(920_000, 920_002):
-            _, info = play(env, seed, idle=idle)
-            assert not info["is_success"], f"seed {seed}: the {idle} hand is not needed"
+            scenario = easiest_for_one_arm(get_task(env.task), seed)
+            assert play(env, seed, scenario=scenario)[1]["is_success"], f"seed {seed}"
+            for idle in SIDES:
+                _, info = play(env, seed, idle=idle, scenario=scenario)
+                assert not info["is_success"], f"seed {seed}: the {idle} hand is not needed"
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("idle", SIDES)
 @pytest.mark.parametrize("name", [*TASKS, *VARYING])
 def test_one_arm_fails_on_many_seeds(name: str, idle: str) -> None:
-    env = BimanualEnv(name)
-    with closing(env):
+    task = get_task(name)
+    with closing(BimanualEnv(name)) as env:
         for seed in range(920_000, 920_040):
-            _, info = play(env, seed, idle=idle)
+            scenario = task.sample(seed) if task.variation.nominal else easiest_for_one_arm(task, seed)
+            _, info = play(env, seed, idle=idle, scenario=scenario)
             assert not info["is_success"], f"seed {seed}: the {idle} hand is not needed"
+
+
+@pytest.mark.parametrize("name", VARYING)
+def test_the_expert_succeeds_where_scenes_vary_and_go_wrong(name: str) -> None:
+    """It may lose one of these: docs/experts.md has its rates."""
+    with closing(BimanualEnv(name)) as env:
+        lost = [seed for seed in range(900_000, 900_004) if not play(env, seed)[1]["is_success"]]
+    assert len(lost) <= 1, lost
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", VARYING)
+def test_the_expert_succeeds_on_many_seeds(name: str) -> None:
+    with closing(BimanualEnv(name)) as env:
+        lost = [seed for seed in range(910_000, 910_060) if not play(env, seed)[1]["is_success"]]
+    assert len(lost) <= 4, lost
 
 
 # ---------------------------------------------------------------------- events
@@ -359,10 +389,33 @@ def test_names_are_unique_within_a_task() -> None:
         assert {factor.name for factor in COMMON} <= set(names)
 
 
-def test_a_scenario_of_another_task_is_refused() -> None:
-    env, scenario = BimanualEnv("table_lift"), get_task("peg_in_hole").sample(0)
-    with pytest.raises(ValueError, match=r"^this is an environment of table_lift, the scenario is of peg_in_hole$"):
+@pytest.mark.parametrize(
+    ("task", "other"),
+    [
+        ("table_lift", "peg_in_hole"),
+        ("peg_in_hole", "peg_in_hole:clearance=0.001"),
+        ("handover", "handover:upright=1,level=hard"),
+    ],
+)
+def test_a_scenario_of_another_task_is_refused(task: str, other: str) -> None:
+    env, scenario = BimanualEnv(task), get_task(other).sample(0)
+    with pytest.raises(ValueError, match=rf"^this is an environment of {task}, the scenario is of {other}$"):
         env.reset(seed=0, options={"scenario": scenario})
+
+
+@pytest.mark.parametrize("name", VARYING)
+def test_a_recorded_scenario_plays_the_same_episode_bit_for_bit(name: str) -> None:
+    text, seen = get_task(name).sample(11).to_json(), []
+    with closing(BimanualEnv(name)) as env:
+        for options in (None, {"scenario": Scenario.from_json(text)}):
+            observation, _ = env.reset(seed=11, options=options)
+            rest = observation["agent_pos"]
+            seen.append(
+                [observation["environment_state"], *(env.step(rest)[0]["environment_state"] for _ in range(12))]
+            )
+            seen[-1].append(env.world.state_vector())
+    for first, second in zip(*seen, strict=True):
+        np.testing.assert_array_equal(first, second)
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ from hdril.simulation.robots import SIDES
 from hdril.simulation.world import ROBOT, World
 from hdril.tasks import TASKS, get_task
 from hdril.tasks.expert import ScriptedExpert
+from hdril.tasks.scenario import Scenario
 
 pytestmark = pytest.mark.parametrize("task", TASKS)
 
@@ -32,18 +33,30 @@ def env(task: str) -> Iterator[BimanualEnv]:
         yield made
 
 
-def play(env: BimanualEnv, seed: int, idle: str | None = None, frames: int | None = None) -> tuple[np.ndarray, dict]:
-    """The expert's episode; ``idle`` names a hand that stays where it is. States of the world, and the last info."""
+def play(
+    env: BimanualEnv,
+    seed: int,
+    idle: str | None = None,
+    frames: int | None = None,
+    scenario: Scenario | None = None,
+) -> tuple[np.ndarray, dict]:
+    """The expert's episode, in the scene of the seed or in ``scenario``; ``idle`` names a hand that stays where it is.
+
+    States of the world, and the last info, which is of no success if the expert gave up.
+    """
     expert = ScriptedExpert(env.task_spec)
-    observation, info = env.reset(seed=seed)
+    observation, info = env.reset(seed=seed, options=None if scenario is None else {"scenario": scenario})
     expert.reset(seed)
     rest = observation["agent_pos"].copy()
     states, done = [env.world.state_vector()], False
     while not done and env.frame != frames:
-        action = expert.act(observation).action
+        try:
+            action = expert.act(env.exact_observation()).action
+        except StopIteration:
+            break
         if idle is not None:
             action[hand_slice(idle)] = rest[hand_slice(idle)]
-        observation, _, terminated, truncated, info = env.step(action)
+        _, _, terminated, truncated, info = env.step(action)
         states.append(env.world.state_vector())
         done = terminated or truncated
     return np.stack(states), info
