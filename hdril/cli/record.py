@@ -21,6 +21,7 @@ from hdril.cli.shards import PlayOptions, check_shards, log_folder
 from hdril.demonstrations.labels import NUMBERS, WORDS, check_forms
 from hdril.demonstrations.provenance import Recipe, read_provenance
 from hdril.demonstrations.record import check_numbers, partial_folder, record, record_shard, refuse_existing
+from hdril.demonstrations.shards import check_unfinished
 from hdril.execution import run_on_ray, submit_to_slurm
 from hdril.tasks import ANY_EVENT, TASKS, base_name
 from hdril.tasks.primitives import Noise
@@ -131,6 +132,7 @@ def _shares(recipe: Recipe, config: RecordConfig, root: Path) -> Callable[[int, 
     """What a cluster does, checked as far as it can be here."""
     check_numbers(config.num_episodes, config.seed, config.workers)
     refuse_existing(root)
+    check_unfinished(partial_folder(root), recipe, config.seed)
     return partial(record_shard, recipe, config.num_episodes, config.seed, root.resolve())
 
 

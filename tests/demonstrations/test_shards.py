@@ -71,7 +71,7 @@ def test_what_cannot_be_read_is_named_and_made_again(damage: str, made_up, tmp_p
     else:
         path.write_bytes({"empty": b"", "garbage": b"no episode", "truncated": whole[: len(whole) // 2]}[damage])
     assert [episode.seed for episode in shards.take()] == [0]
-    assert f"{path} cannot be read" in capsys.readouterr().out
+    assert f"{path} is damaged: " in capsys.readouterr().out
     shards.put(made_up(1))
     assert [episode.seed for episode in shards.take()] == [0, 1, 2]
 
