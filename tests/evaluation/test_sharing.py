@@ -136,6 +136,23 @@ def test_a_damaged_record_is_told(policy: Path, tmp_path: Path) -> None:
     assert listing(tmp_path) == before
 
 
+def test_the_experts_cache_costs_time_and_nothing_else(
+    policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    play(policy, tmp_path / "first")
+    (folder,) = (tmp_path / "cache/hdril/expert").iterdir()
+    kept = listing(folder)
+    (folder / f"{SEED}.npz").write_bytes(b"power cut")
+    (folder / f"{SEED + 1}.npz").write_bytes(kept[f"{SEED + 1}.npz"][:900])
+    play(policy, tmp_path / "second")
+    assert listing(folder) == kept, "made again"
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))  # no folder can be made in it
+    play(policy, tmp_path / "third")
+    assert reports(tmp_path / "first") == reports(tmp_path / "second") == reports(tmp_path / "third")
+
+
 def test_a_suite_in_shards(policy: Path, tmp_path: Path, played: list[int]) -> None:
     options = {"suite": "factors", "cells": "push", "num_episodes": 2}
     play(policy, tmp_path / "alone", **options)
