@@ -8,6 +8,7 @@ import resource
 import sys
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -284,3 +285,23 @@ def test_an_evaluation_leaves_a_foreign_file_alone(evaluating: list[str], tmp_pa
     for more in ([], ["--shards=2", "--shard=1"]):
         assert refuse(evaluation.main, *evaluating, *more) == told
     assert listing(partial.parent) == {"eval.partial": b"a letter"}
+
+
+class Deadly:
+    """Ends the process that it is sent to."""
+
+    def __reduce__(self) -> tuple[Callable[[int], object], tuple[int]]:
+        return os._exit, (1,)
+
+
+def test_an_evaluation_whose_worker_dies(evaluating: list[str], tmp_path: Path, refuse: Refuse, monkeypatch) -> None:
+    three = [*evaluating, "--num_episodes=3"]
+    evaluate(*three, "--shards=3", "--shard=0", patch=monkeypatch)
+    before = listing(tmp_path / "here/eval.partial/shards")
+    make_job = evaluation.make_job
+    with monkeypatch.context() as patch:
+        patch.setattr(evaluation, "make_job", lambda *a, **k: replace(make_job(*a, **k), overrides=(Deadly(),)))
+        told = refuse(evaluation.main, *three, "--workers=2")
+    assert told == "a worker process was killed; 2 workers may need more memory than there is: try fewer\n"
+    assert listing(tmp_path / "here/eval.partial/shards") == before
+    assert not (tmp_path / "here/eval").exists()
