@@ -73,6 +73,11 @@ def check_execution(executor: str, shards: int, slurm: SlurmConfig) -> None:
             raise ValueError("--executor=slurm needs --slurm.partition: the name of a partition, as sinfo lists them")
         if shutil.which("sbatch") is None:
             raise UserError("--executor=slurm needs Slurm's sbatch, which is not on the PATH")
+        if not _activate().exists():
+            raise UserError(
+                f"--executor=slurm needs {_activate()}, which its jobs source: "
+                "start hdril from an environment that python -m venv or uv venv made"
+            )
     if executor == "ray" and find_spec("ray") is None:
         raise UserError("--executor=ray needs Ray, the extra ray of hdril")
 
@@ -126,6 +131,7 @@ def submit_to_slurm(
 
     Raises:
         UserError: Slurm refused; says why.
+        OSError: the folder of the logs cannot be written.
     """
     from datatrove.executor import SlurmPipelineExecutor
 
@@ -135,7 +141,7 @@ def submit_to_slurm(
         "time": slurm.time,
         "mem_per_cpu_gb": slurm.mem_per_cpu_gb,
         "qos": slurm.qos,
-        "venv_path": str(Path(sys.prefix) / "bin" / "activate"),
+        "venv_path": str(_activate()),
         "sbatch_args": {"account": slurm.account} if slurm.account else {},
     }
 
@@ -155,9 +161,14 @@ def submit_to_slurm(
     )  # fmt: skip
     try:
         last.run()
-    except (OSError, subprocess.CalledProcessError) as error:
+    except subprocess.CalledProcessError as error:
         raise UserError(f"Slurm refused the jobs: {error}") from error
     return str(array.job_id), str(last.job_id)
+
+
+def _activate() -> Path:
+    """What makes this environment that of a shell; datatrove's jobs begin with it."""
+    return Path(sys.prefix) / "bin" / "activate"
 
 
 def _quiet() -> None:

@@ -6,12 +6,13 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from hdril.cli.record import RecordConfig, record_command
-from hdril.demonstrations.episode import demonstrate
+from hdril.demonstrations.episode import Episode, demonstrate
 from hdril.demonstrations.provenance import Provenance, Recipe, read_provenance
 from hdril.demonstrations.record import partial_folder, record, record_shard
 from hdril.demonstrations.shards import Shards
@@ -37,7 +38,7 @@ def test_a_share_that_there_is_not(shard: int) -> None:
         share(range(10), shard, 3)
 
 
-def test_what_is_missing_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_missing_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     check_execution("local", 1, SlurmConfig())
     with pytest.raises(ValueError, match="executor must be local, slurm, ray, got 'lsf'"):
         check_execution("lsf", 1, SlurmConfig())
@@ -45,6 +46,13 @@ def test_what_is_missing_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
         check_execution("local", 0, SlurmConfig())
     with pytest.raises(ValueError, match=r"--executor=slurm needs --slurm\.partition"):
         check_execution("slurm", 2, SlurmConfig())
+    with monkeypatch.context() as patch:
+        slurm = FakeSlurm(tmp_path, patch)
+        patch.setattr("sys.prefix", str(tmp_path / "conda"))
+        config = RecordConfig(num_episodes=1, root=tmp_path / "set", executor="slurm", slurm=SlurmConfig("cpu"))
+        with pytest.raises(UserError, match=r"needs .*conda/bin/activate, which its jobs source: start hdril from"):
+            record_command(config)
+        assert not slurm.jobs
     monkeypatch.setenv("PATH", "")
     with pytest.raises(UserError, match="--executor=slurm needs Slurm's sbatch, which is not on the PATH"):
         check_execution("slurm", 2, SlurmConfig(partition="all"))
@@ -150,6 +158,21 @@ def test_a_slurm_that_refuses_says_why(tmp_path: Path, monkeypatch: pytest.Monke
     config = RecordConfig(num_episodes=1, root=tmp_path / "set", executor="slurm", slurm=SlurmConfig("cpu"))
     with pytest.raises(UserError, match=r"Slurm refused the jobs: .*exit status 3"):
         record_command(config)
+
+
+def test_what_is_in_the_way_is_told_before_jobs_are_submitted(
+    made_up: Callable[..., Episode], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slurm, root = FakeSlurm(tmp_path / "slurm", monkeypatch), tmp_path / "set"
+    config = RecordConfig(num_episodes=1, root=root, executor="slurm", slurm=SlurmConfig("cpu"))
+    (tmp_path / "set.jobs").touch()  # where logs go
+    with pytest.raises(OSError, match=r"set\.jobs"):
+        record_command(config)
+    (tmp_path / "set.jobs").unlink()
+    Shards(partial_folder(root), RECIPE, 50).put(made_up(50))
+    with pytest.raises(ValueError, match="holds episodes of another recipe"):
+        record_command(config)
+    assert not slurm.jobs
 
 
 def _record(root: Path, *options: str) -> str:

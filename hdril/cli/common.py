@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import sys
@@ -16,6 +17,12 @@ from hdril.errors import UserError
 
 EXPECTED = (UserError, ValueError, OSError)
 """Failures that the user can mend. Anything else is a bug, and keeps its traceback."""
+_REMEDIES = {
+    ("ENOSPC", "EDQUOT", "EFBIG"): "make room there, then give the same command again",
+    ("EROFS", "EACCES", "EPERM"): "change that, or choose another place",
+    ("EEXIST", "ENOTDIR", "EISDIR", "ENOTEMPTY"): "something is in the way: move it, or choose another place",
+}
+"""What to do about failures of the system, by their names."""
 
 
 def check_repo_id(option: str, repo_id: str) -> None:
@@ -75,8 +82,18 @@ def run(program: str, config_class: type[Any], command: Callable[[Any], None], p
         reason = _reason(error)
         if os.environ.get("HDRIL_DEBUG") or not isinstance(reason, (*EXPECTED, draccus.utils.DraccusException)):
             raise
-        print(f"{program}: error: {' '.join(str(reason).split())}", file=sys.stderr)
+        print(f"{program}: error: {' '.join(_words(reason).split())}", file=sys.stderr)
         sys.exit(2)
+
+
+def _words(error: BaseException) -> str:
+    """What failed, and for a failure of the system which file, why, and what to do."""
+    if isinstance(error, OSError) and error.errno is not None:
+        for names, remedy in _REMEDIES.items():
+            if errno.errorcode.get(error.errno) in names:
+                where = f"{error.filename}: " if error.filename else ""
+                return f"{where}{os.strerror(error.errno)}; {remedy}"
+    return str(error)
 
 
 def _reason(error: BaseException) -> BaseException:

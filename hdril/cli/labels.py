@@ -7,6 +7,7 @@ from pathlib import Path
 
 from hdril.cli.common import run
 from hdril.demonstrations.labels import check_forms, convert
+from hdril.demonstrations.read import read_primitives
 
 
 @dataclass
@@ -31,7 +32,8 @@ def labels_command(config: LabelsConfig) -> None:
     if not form:
         raise ValueError(f"to must be one form, got {config.to!r}")
     convert(config.dataset, form, config.output)
-    print(f"{config.output} has labels in {form}, too")
+    names = ", ".join(read_primitives(config.output))  # a word that was mistyped is seen
+    print(f"{config.output} has labels in {form}, too: {names}")
 
 
 def main() -> None:

@@ -18,9 +18,10 @@ from hdril import __version__
 from hdril.cli.check import CheckConfig, check_command
 from hdril.cli.common import check_repo_id, run
 from hdril.cli.shards import PlayOptions, check_shards, log_folder
-from hdril.demonstrations.labels import NUMBERS, WORDS, check_forms
+from hdril.demonstrations.labels import FORMS, NUMBERS, WORDS, check_forms, forms_of
 from hdril.demonstrations.provenance import Recipe, read_provenance
 from hdril.demonstrations.record import check_numbers, partial_folder, record, record_shard, refuse_existing
+from hdril.demonstrations.shards import check_unfinished
 from hdril.execution import run_on_ray, submit_to_slurm
 from hdril.tasks import ANY_EVENT, TASKS, base_name
 from hdril.tasks.primitives import Noise
@@ -131,6 +132,7 @@ def _shares(recipe: Recipe, config: RecordConfig, root: Path) -> Callable[[int, 
     """What a cluster does, checked as far as it can be here."""
     check_numbers(config.num_episodes, config.seed, config.workers)
     refuse_existing(root)
+    check_unfinished(partial_folder(root), recipe, config.seed)
     return partial(record_shard, recipe, config.num_episodes, config.seed, root.resolve())
 
 
@@ -204,6 +206,11 @@ def _check_same(root: Path, recipe: Recipe, config: RecordConfig) -> None:
         raise FileExistsError(
             f"{root} exists and was recorded by hdril {provenance.hdril_version}, not by {__version__}; "
             "choose another root or delete it"
+        )
+    if (there := forms_of(root)) != tuple(form for form in FORMS if form in check_forms(config.labels)):
+        raise FileExistsError(
+            f"{root} exists and has labels in {' and '.join(there) or 'no form'}, not in {config.labels}; "
+            f"give --labels={','.join(there)}, or choose another root"
         )
 
 

@@ -27,6 +27,7 @@ from hdril.files import write_atomically
 NUMBERS, WORDS = "subtask_index", "language"
 FORMS = (NUMBERS, WORDS)
 """Names of the forms."""
+_COLUMNS = {NUMBERS: SUBTASK, WORDS: LANGUAGE}
 _ROWS = pa.list_(
     pa.struct(
         {"role": pa.string(), "content": pa.string(), "style": pa.string(), "timestamp": pa.float32(),
@@ -50,6 +51,13 @@ def check_forms(text: str) -> tuple[str, ...]:
     return forms
 
 
+def forms_of(root: Path) -> tuple[str, ...]:
+    """The forms in which the frames of a dataset are labelled, in the order of :data:`FORMS`."""
+    # Not info.json: LeRobot's annotation tool drops the column and leaves its declaration.
+    there = {name for file in _files(root) for name in pq.read_schema(file).names}
+    return tuple(form for form in FORMS if _COLUMNS[form] in there)
+
+
 def language_rows(names: Sequence[str], times: Sequence[float]) -> list[dict[str, Any]]:
     """Rows of :data:`~hdril.demonstrations.schema.LANGUAGE` that say what begins at which time, s."""
     empty = {"camera": None, "tool_calls": None}
@@ -71,13 +79,11 @@ def labels_of(
     """Labels (T,), and whether a primitive starts at each frame (T,), from when each begins.
 
     Raises:
-        ValueError: no primitive begins at the first frame, two begin at the same one, or one is not known.
+        ValueError: no primitive begins at the first frame, two begin at the same one, or one is not among ``primitives``.
     """
     frames = np.searchsorted(time, np.array([at for at, _ in subtasks]) - 1e-4)  # float32 or float64
     if not len(frames) or frames[0] > 0 or frames[-1] >= len(time) or (np.diff(frames) <= 0).any():
         raise ValueError(f"rows of the style {STYLE!r} must begin with the first frame, and no two at the same")
-    if unknown := [name for _, name in subtasks if name not in primitives]:
-        raise ValueError(f"{unknown[0]!r} is not in {SUBTASKS_PATH}")
     starts = np.zeros(len(time), np.bool_)
     starts[frames] = True
     numbers = np.array([primitives.index(name) for _, name in subtasks], np.int64)
@@ -111,17 +117,17 @@ def add_words(root: Path) -> None:
 def add_numbers(root: Path) -> None:
     """Add ``subtask_index``, ``subtask_start`` and ``meta/subtasks.parquet`` to a dataset that has labels in words.
 
-    Primitives are numbered as in ``meta/subtasks.parquet`` if there is one, or in the order in which they first appear.
+    The words are what counts, because ``meta/subtasks.parquet`` may be older: those that it names come first, in its order, then
+    the others as they first appear. Names that no word has are left out, because nothing can be learned of them.
 
     Raises:
         ValueError: an episode has no rows of the style ``subtask``, or such that cannot be; names it.
     """
-    if (root / SUBTASKS_PATH).exists():
-        primitives = list(read_primitives(root))
-    else:
-        tables = (table.column(LANGUAGE) for table in map(pq.read_table, _files(root)))
-        rows = (cell.as_py() for column in tables for cell in column)
-        primitives = list(dict.fromkeys(name for row in rows for _, name in subtasks_of(row)))
+    tables = (pq.read_table(file, columns=[LANGUAGE])[LANGUAGE] for file in _files(root))
+    rows = (cell.as_py() for column in tables for cell in column)
+    words = dict.fromkeys(name for row in rows for _, name in subtasks_of(row))
+    named = read_primitives(root) if (root / SUBTASKS_PATH).exists() else ()
+    primitives = [name for name in dict.fromkeys((*named, *words)) if name in words]
 
     def add(episode: pa.Table) -> pa.Table:
         try:
@@ -146,14 +152,12 @@ def convert(root: Path, form: str, output: Path) -> None:
         ValueError: the dataset has this form already, or not the other; or its labels cannot be converted.
     """
     read_info(root)
-    # Not info.json: LeRobot's annotation tool drops the column and leaves its declaration.
-    there = {name for file in _files(root) for name in pq.read_schema(file).names}
-    columns = {NUMBERS: SUBTASK, WORDS: LANGUAGE}
+    there = forms_of(root)
     (other,) = set(FORMS) - {form}
-    if columns[form] in there:
-        raise ValueError(f"{root} has a column {columns[form]} already")
-    if columns[other] not in there:
-        raise ValueError(f"{root} has no column {columns[other]} to take the labels from")
+    if form in there:
+        raise ValueError(f"{root} has a column {_COLUMNS[form]} already")
+    if other not in there:
+        raise ValueError(f"{root} has no column {_COLUMNS[other]} to take the labels from")
     if output.exists():
         raise FileExistsError(f"{output} exists; choose another output or delete it")
     output.parent.mkdir(parents=True, exist_ok=True)

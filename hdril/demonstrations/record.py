@@ -15,12 +15,12 @@ from hdril.actor import Actor
 from hdril.demonstrations.episode import Episode, demonstrate
 from hdril.demonstrations.labels import add_words
 from hdril.demonstrations.provenance import Provenance, Recipe
-from hdril.demonstrations.shards import Shards
+from hdril.demonstrations.shards import Shards, check_unfinished, remove_lock
 from hdril.demonstrations.write import write_dataset
 from hdril.env import BimanualEnv
 from hdril.errors import UserError
 from hdril.execution import share
-from hdril.files import MAX_SEED, exclusively
+from hdril.files import MAX_SEED, exclusively, naming
 from hdril.workers import worker_pool
 
 PATIENCE = 20
@@ -92,25 +92,32 @@ def record(
     of kept and dropped episodes. With ``words``, the primitives are in ``language_persistent``, too.
 
     Raises:
-        FileExistsError: there is something at ``root``.
-        ValueError: a number out of range, a partial recording of another recipe, or too few seeds up to the largest.
+        FileExistsError: there is something at ``root``, or something that is no recording at ``<root>.partial``.
+        ValueError: a number out of range, a partial recording of another recipe, or too few seeds up to the largest; an
+            episode was damaged after it was looked at.
         ExpertError: the expert fails more often than it succeeds.
         BusyError: another process records to ``root``.
+        OSError: something cannot be written; names it. Episodes that were played are kept.
     """
     check_numbers(num_episodes, first_seed, workers)
     refuse_existing(root)
     partial = partial_folder(root)
+    check_unfinished(partial, recipe, first_seed)  # before there is a lock in it
     with exclusively(partial, f"recording to {root}"):
         try:
             refuse_existing(root)  # the process that held the lock until now may have finished it
             shards = Shards(partial, recipe, first_seed)
+        except BaseException:
+            remove_lock(partial)  # what else came there meanwhile is not of this recording
+            raise
+        try:
             selection = _Selection(num_episodes, progress)
             _fill(selection, shards, lambda seed: episodes(recipe, seed, workers), first_seed)
             provenance = Provenance(recipe, tuple(selection.kept), selection.dropped)
-            provenance = _publish(provenance, shards, partial, root, words)
+            provenance = _publish(provenance, shards, root, words)
         except BaseException as error:
-            if isinstance(error, ExpertError) or not any(partial.glob("*.npz")):
-                shutil.rmtree(partial)  # there is nothing to go on from
+            if isinstance(error, ExpertError) or shards.empty:
+                shards.remove()  # there is nothing to go on from
             raise
     return provenance
 
@@ -217,14 +224,14 @@ def _fill(selection: _Selection, shards: Shards, stream: Callable[[int], Generat
     raise ValueError(f"only {len(selection.kept)} demonstrations succeeded up to the largest seed; choose a lower seed")
 
 
-def _publish(provenance: Provenance, shards: Shards, partial: Path, root: Path, words: bool) -> Provenance:
+def _publish(provenance: Provenance, shards: Shards, root: Path, words: bool) -> Provenance:
     """Write the dataset beside its place and move it there when it is whole; returns its provenance with its digest."""
-    staged = partial / "dataset"
-    shutil.rmtree(staged, ignore_errors=True)
-    provenance = write_dataset(staged, provenance, map(shards.get, provenance.seeds))
-    if words:
-        add_words(staged)
+    shutil.rmtree(shards.staged, ignore_errors=True)
+    with naming(shards.staged):
+        provenance = write_dataset(shards.staged, provenance, map(shards.get, provenance.seeds))
+        if words:
+            add_words(shards.staged)
     root.parent.mkdir(parents=True, exist_ok=True)
-    staged.replace(root)
-    shutil.rmtree(partial, ignore_errors=True)
+    shards.staged.replace(root)
+    shards.remove()
     return provenance

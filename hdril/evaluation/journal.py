@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -13,7 +15,7 @@ from hdril.errors import UserError
 from hdril.evaluation.identity import Identity
 from hdril.evaluation.score import Outcome
 from hdril.evaluation.unfinished import UnfinishedFolder
-from hdril.files import exclusively, write_atomically
+from hdril.files import exclusively, naming, write_atomically
 
 _OUTCOMES, _SHARDS = "outcomes.jsonl", "shards"
 
@@ -36,9 +38,9 @@ class Journal:
         self.done = self._read()
         """Outcomes by seed: those of before, and those that were added."""
 
-    def _read(self) -> dict[int, Outcome]:
+    def _read(self, tell: bool = False) -> dict[int, Outcome]:
         files = [self.folder / _OUTCOMES, *sorted((self.folder / _SHARDS).glob(f"*/{_OUTCOMES}"))]
-        return {outcome.seed: outcome for path in files for outcome in _read_outcomes(path)}
+        return {outcome.seed: outcome for path in files for outcome in _read_outcomes(path, tell)}
 
     @contextmanager
     def writing(self) -> Iterator[Callable[[Outcome], None]]:
@@ -50,13 +52,14 @@ class Journal:
             BusyError: another process writes here.
             ValueError, FileExistsError: as for the class, if another process wrote here since.
         """
-        # Files count, too: what another process played since must stay if it cannot be read.
-        with self._unfinished.writing(
-            begun=lambda: (self.folder / _SHARDS).exists() or bool(self.done or self._read())
-        ):
-            self.done = self._read()
-            with self._appending(self.folder / _OUTCOMES) as add:
-                yield add
+        with self._unfinished.writing(begun=self._begun):
+            self.done = self._read(tell=True)
+            yield self._appender(self.folder / _OUTCOMES)
+
+    def _begun(self) -> bool:
+        """Whether something was played, by whatever process and though it cannot be read."""
+        path = self.folder / _OUTCOMES
+        return (self.folder / _SHARDS).exists() or (path.exists() and b"\n" in path.read_bytes())
 
     @contextmanager
     def sharing(self, shard: int, shards: int) -> Iterator[Callable[[Outcome], None]]:
@@ -70,26 +73,26 @@ class Journal:
         self._unfinished.begin_share()
         folder = self.folder / _SHARDS / f"{shard}-of-{shards}"
         with exclusively(folder, f"playing shard {shard} of {shards}"):
-            self.done = self._read()
-            with self._appending(folder / _OUTCOMES) as add:
-                yield add
+            self.done = self._read(tell=True)
+            yield self._appender(folder / _OUTCOMES)
 
-    @contextmanager
-    def _appending(self, path: Path) -> Iterator[Callable[[Outcome], None]]:
-        """Gives a function that adds an outcome to a file of outcomes."""
+    def _appender(self, path: Path) -> Callable[[Outcome], None]:
+        """A function that adds an outcome to a file of outcomes."""
         _drop_half_line(path)
-        with path.open("a") as file:
+        path.touch()
 
-            def add(outcome: Outcome) -> None:
-                if not path.exists():
-                    raise UserError(
-                        f"{path.parent} was removed by another process, which finished the evaluation or gave it up"
-                    )
-                file.write(json.dumps(asdict(outcome)) + "\n")
-                file.flush()
-                self.done[outcome.seed] = outcome
+        def add(outcome: Outcome) -> None:
+            try:
+                # Opened each time: a file that is closed later tells of a full disk once more, and in another context.
+                with naming(path), path.open("r+") as file:  # which makes no file
+                    file.seek(0, os.SEEK_END)
+                    file.write(json.dumps(asdict(outcome)) + "\n")
+            except FileNotFoundError:
+                told = f"{path.parent} was removed by another process, which finished the evaluation or gave it up"
+                raise UserError(told) from None
+            self.done[outcome.seed] = outcome
 
-            yield add
+        return add
 
     def finish(self) -> None:
         """Rename the folder to the output: all is written. Call it within :meth:`writing`, which keeps others out.
@@ -107,14 +110,21 @@ def _drop_half_line(path: Path) -> None:
         write_atomically(path, lambda file: file.write(text[: text.rfind(b"\n") + 1]))
 
 
-def _read_outcomes(path: Path) -> Iterator[Outcome]:
-    for line in path.read_text().splitlines() if path.exists() else ():
+def _read_outcomes(path: Path, tell: bool) -> Iterator[Outcome]:
+    """Outcomes of all lines that can be read, and on request a message about each that cannot: its episode is played again."""
+    lines = path.read_bytes().splitlines(keepends=True) if path.exists() else []
+    for number, line in enumerate(lines, 1):
         try:
-            values: dict[str, Any] = json.loads(line)
-        except json.JSONDecodeError:
-            return  # the process ended while it wrote the last line: that seed is played again
-        for name in ("start", "primitives"):
-            values[name] = tuple(values[name])
-        for name in ("events", "noticed"):
-            values[name] = tuple((frame, words) for frame, words in values[name])
-        yield Outcome(**values)
+            yield _outcome(json.loads(line))
+        except (ValueError, TypeError, KeyError) as error:
+            if tell and line.endswith(b"\n"):  # else the process ended while it wrote the last line
+                why = f"{path}, line {number} is damaged: {error}"
+                print(f"{why}; the episode is played again", file=sys.stderr, flush=True)
+
+
+def _outcome(values: dict[str, Any]) -> Outcome:
+    for name in ("start", "primitives"):
+        values[name] = tuple(values[name])
+    for name in ("events", "noticed"):
+        values[name] = tuple((frame, words) for frame, words in values[name])
+    return Outcome(**values)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hdril.digest import digest_file, digest_json
 from hdril.env import BimanualEnv
 from hdril.evaluation.software import episode_software
-from hdril.files import cache_folder, write_atomically
+from hdril.files import cache_folder, read_arrays, write_atomically
 from hdril.rollout import Ending
 from hdril.tasks import DETAILED, Task, base_name, task_parameters
 from hdril.tasks.expert import ScriptedExpert
@@ -63,16 +63,18 @@ class ReferenceCache:
     def get(self, seed: int) -> Reference:
         """The expert's episode of this seed, played now unless it is there."""
         path = self._folder / f"{seed}.npz"
-        if path.exists():
-            with np.load(path) as data:
-                return Reference(
-                    data["state"],
-                    data["objects"],
-                    data["scripted"],
-                    bool(data["success"]),
-                    str(data["unmet"]),
-                )
+        # A cache that is damaged or cannot be written costs time and nothing else.
+        with suppress(OSError, ValueError, KeyError):
+            data = read_arrays(path)
+            return Reference(
+                data["state"],
+                data["objects"],
+                data["scripted"],
+                bool(data["success"]),
+                str(data["unmet"]),
+            )
         with closing(self._env):
             reference = Reference.of(self._env.task_spec, *trace_episode(self._env, self._expert, seed))
-        write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **vars(reference)))
+        with suppress(OSError):
+            write_atomically(path, lambda file: np.savez(file, allow_pickle=False, **vars(reference)))
         return reference

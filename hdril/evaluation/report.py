@@ -11,6 +11,7 @@ from typing import Any
 from hdril.evaluation.picture import draw
 from hdril.evaluation.results import Comparison, Run, headline, summarise
 from hdril.evaluation.score import DEPARTURE, Outcome, in_words
+from hdril.files import naming
 from hdril.markdown import table
 from hdril.tasks import get_task
 
@@ -31,9 +32,10 @@ def write_report(
         comparison: success against another policy on the same seeds, see :func:`hdril.evaluation.results.compare`.
     """
     summary = summarise(run, outcomes, comparison)
-    (folder / "results.json").write_text(json.dumps(summary, indent=2))
-    draw(folder / PICTURE, outcomes, summary)
-    (folder / "report.md").write_text(markdown(summary, outcomes))
+    with naming(folder):
+        (folder / "results.json").write_text(json.dumps(summary, indent=2))
+        draw(folder / PICTURE, outcomes, summary)
+        (folder / "report.md").write_text(markdown(summary, outcomes))
     return summary
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from hdril.files import naming
 from hdril.markdown import table
 
 PICTURE = "suite.png"
@@ -22,9 +23,10 @@ _MOTION = (
 
 def write_suite(folder: Path, data: Mapping[str, Any]) -> None:
     """Write the report into ``folder``, which exists and holds a folder for each cell."""
-    (folder / "suite.json").write_text(json.dumps(data, indent=2))
-    draw_suite(folder / PICTURE, data)
-    (folder / "suite.md").write_text(suite_markdown(data))
+    with naming(folder):
+        (folder / "suite.json").write_text(json.dumps(data, indent=2))
+        draw_suite(folder / PICTURE, data)
+        (folder / "suite.md").write_text(suite_markdown(data))
 
 
 def suite_markdown(data: Mapping[str, Any]) -> str:

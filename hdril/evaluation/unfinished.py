@@ -12,17 +12,11 @@ from typing import Any
 
 from hdril.evaluation.checkpoint import read_json
 from hdril.evaluation.identity import require_same
-from hdril.files import BusyError, exclusively, write_atomically
+from hdril.files import LOCK, BusyError, exclusively, is_scrap, write_atomically
 
-_LOCK = "lock"
 _PATIENCE = 30.0
 """s that a share waits for others that begin at the same time."""
 _REMEDY = "delete it or choose another output_dir"
-
-
-def _is_scrap(name: str) -> bool:
-    """Whether a file of this name is what a killed process left of one that it was writing."""
-    return name.startswith(".") and name.endswith(".tmp")
 
 
 class UnfinishedFolder:
@@ -50,7 +44,7 @@ class UnfinishedFolder:
         if self.output.exists():
             raise FileExistsError(f"{self.output} exists; choose another output_dir or delete it")
         # Another process may write its record between the two looks: then the second one sees it.
-        if not self._same() and self._holds_more_than(_LOCK) and not self._same():
+        if not self._same() and self._holds_more_than(LOCK) and not self._same():
             raise FileExistsError(f"{self.folder} exists and is no {self._kind}; {_REMEDY}")
 
     def _same(self) -> bool:
@@ -58,7 +52,10 @@ class UnfinishedFolder:
         path = self.folder / self._record
         if not path.exists():
             return False
-        record = read_json(path)
+        try:
+            record = read_json(path)
+        except ValueError as error:
+            raise ValueError(f"{error}; what is in {self.folder} is not known: {_REMEDY}") from None
         require_same(str(self.folder), record.get(self._key) if self._key else record, self._identity, _REMEDY)
         return True
 
@@ -66,7 +63,7 @@ class UnfinishedFolder:
         """Whether there are other files and folders than these. What a kill left of a file that was being written counts
         as nothing."""
         there = [path.name for path in self.folder.iterdir()] if self.folder.exists() else []
-        return any(name not in names and not _is_scrap(name) for name in there)
+        return any(name not in names and not is_scrap(name) for name in there)
 
     @contextmanager
     def writing(self, begun: Callable[[], bool] | None = None) -> Iterator[None]:
@@ -82,9 +79,9 @@ class UnfinishedFolder:
         missing = [path for path in self.folder.parents if not path.exists()]
         # A process that is kept out must not remove what the other one writes: the cleaning is done under the lock.
         with exclusively(self.folder, f"evaluating into {self.output}"):
-            with self._removed_unless(lambda: self._holds_more_than(_LOCK), missing):  # refused: the lock was made here
+            with self._removed_unless(lambda: self._holds_more_than(LOCK), missing):  # refused: the lock was made here
                 self._check()
-            with self._removed_unless(begun or (lambda: self._holds_more_than(self._record, _LOCK)), missing):
+            with self._removed_unless(begun or (lambda: self._holds_more_than(self._record, LOCK)), missing):
                 self._write_record()
                 yield
 
@@ -135,8 +132,8 @@ class UnfinishedFolder:
         """
         self.folder.replace(self.output)
         # Afterwards: if the process were killed before the folder is renamed, what was played would be lost with these.
-        scraps = [path.name for path in self.output.iterdir() if _is_scrap(path.name)]
-        for path in (self.output / name for name in (*scratch, *scraps, self._record, _LOCK)):
+        scraps = [path.name for path in self.output.iterdir() if is_scrap(path.name)]
+        for path in (self.output / name for name in (*scratch, *scraps, self._record, LOCK)):
             if path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)  # a share that is late may still write there
             else:

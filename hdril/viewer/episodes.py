@@ -21,7 +21,7 @@ from hdril.evaluation.score import score_episode
 from hdril.evaluation.stored import StoredEvaluation
 from hdril.trace import trace_episode
 from hdril.viewer.log import TIMELINE, log_lane
-from hdril.viewer.recordings import APPLICATION, recording_name, write_episodes
+from hdril.viewer.recordings import APPLICATION, recording_name, write_episodes, written
 
 
 def find_recordings(folder: Path, seed: int | None = None) -> list[Path]:
@@ -115,7 +115,7 @@ def _foreign(stored: StoredEpisode, path: Path) -> Path:
     at = [rr.TimeColumn(TIMELINE, duration=stored.time)]
     path.parent.mkdir(parents=True, exist_ok=True)
     views: list[Any] = [rrb.Spatial3DView(origin="world", name="Poses")]
-    with rr.RecordingStream(APPLICATION) as stream:
+    with written(path), rr.RecordingStream(APPLICATION) as stream:
         stream.save(path)
         for key, signal in stored.signals.items():
             for name, values in zip(signal.names, signal.values.T, strict=True):

@@ -15,6 +15,7 @@ from lerobot.utils.constants import HF_LEROBOT_HOME
 
 from hdril import __version__
 from hdril.cli.record import RecordConfig, default_root, record_command
+from hdril.demonstrations.labels import add_words
 from hdril.demonstrations.provenance import Provenance, Recipe, read_provenance
 from hdril.demonstrations.write import write_dataset
 from tests.cli.commands import refuse, start, succeed
@@ -73,6 +74,27 @@ def test_a_dataset_whose_first_seed_was_dropped_is_known_again(made_up, pushed: 
         options: dict[str, Any] = {"num_episodes": 2, "seed": 5} | other
         with pytest.raises(FileExistsError, match="holds something else"):
             record_command(RecordConfig(repo_id="user/name", root=root, push=True, **options))
+    assert pushed == ["user/name"]
+
+
+def test_a_dataset_with_other_labels_is_not_published_as_what_was_asked_for(
+    made_up, pushed: list[str], tmp_path: Path
+) -> None:
+    root = tmp_path / "set"
+    write_dataset(root, Provenance(Recipe("table_lift"), (5,)), [made_up(5)])
+
+    def push(labels: str) -> None:
+        record_command(RecordConfig(repo_id="user/name", num_episodes=1, seed=5, root=root, push=True, labels=labels))
+
+    with pytest.raises(
+        FileExistsError, match="has labels in subtask_index, not in language,subtask_index; give --labels="
+    ):
+        push("language,subtask_index")
+    assert pushed == []
+    add_words(root)
+    push("language,subtask_index")
+    with pytest.raises(FileExistsError, match="not in subtask_index; give --labels=subtask_index,language, or choose"):
+        push("subtask_index")
     assert pushed == ["user/name"]
 
 

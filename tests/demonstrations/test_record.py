@@ -190,7 +190,7 @@ def test_an_unreadable_episode_is_made_again(made_up, tmp_path: Path, monkeypatc
     (tmp_path / "set.partial/1.npz").write_bytes(b"power cut")
     monkeypatch.setattr(recording, "episodes", scripted(made_up))
     assert record(Recipe("table_lift"), 4, 0, root).seeds == (0, 1, 2, 3)
-    assert "1.npz cannot be read" in capsys.readouterr().out
+    assert "1.npz is damaged: " in capsys.readouterr().out
     np.testing.assert_array_equal(read_episode(root, 1).action, made_up(1).action)
 
 

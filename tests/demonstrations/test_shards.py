@@ -54,7 +54,9 @@ def test_episodes_are_taken_up_to_the_first_gap(made_up, tmp_path: Path) -> None
     assert [episode.seed for episode in shards.take()] == [5, 6]
 
 
-@pytest.mark.parametrize("damage", ["empty", "garbage", "truncated", "of another seed", "incomplete", "ragged"])
+@pytest.mark.parametrize(
+    "damage", ["empty", "garbage", "truncated", "method", "of another seed", "incomplete", "ragged"]
+)
 def test_what_cannot_be_read_is_named_and_made_again(damage: str, made_up, tmp_path: Path, capsys) -> None:
     shards = Shards(tmp_path, RECIPE, 0)
     for seed in (0, 1, 2):
@@ -69,9 +71,12 @@ def test_what_cannot_be_read_is_named_and_made_again(damage: str, made_up, tmp_p
     elif damage == "ragged":
         shards.put(replace(made_up(1), action=made_up(1).action[:-1]))
     else:
-        path.write_bytes({"empty": b"", "garbage": b"no episode", "truncated": whole[: len(whole) // 2]}[damage])
+        method = whole.index(b"PK\x01\x02") + 10  # of compression, in the archive's directory
+        changed = whole[:method] + b"\x63" + whole[method + 1 :]
+        half = whole[: len(whole) // 2]
+        path.write_bytes({"empty": b"", "garbage": b"no episode", "truncated": half, "method": changed}[damage])
     assert [episode.seed for episode in shards.take()] == [0]
-    assert f"{path} cannot be read" in capsys.readouterr().out
+    assert f"{path} is damaged: " in capsys.readouterr().out
     shards.put(made_up(1))
     assert [episode.seed for episode in shards.take()] == [0, 1, 2]
 

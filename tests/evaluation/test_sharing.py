@@ -106,6 +106,53 @@ def test_what_a_killed_shard_left_is_kept_and_the_rest_is_played(
     assert reports(output) == alone
 
 
+def test_a_damaged_line_loses_its_own_episode_and_is_told_once(
+    policy: Path, alone: dict[str, bytes], tmp_path: Path, played: list[int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "eval"
+    play(policy, output, rerun="all", shards=2, shard=1)
+    path = tmp_path / "eval.partial/shards/1-of-2/outcomes.jsonl"
+    first, last = path.read_bytes().splitlines(keepends=True)
+    for damaged in (b"\xff" + first, first.replace(b"{", b"", 1), b'{"seed": 1}\n', b"3\n"):
+        path.write_bytes(damaged + last)
+        assert set(Journal(output, make_job("table_lift", str(policy), SEED, COUNT).identity).done) == {SEED + 2}
+    played.clear()
+    capsys.readouterr()
+    play(policy, output, rerun="all")
+    assert played == [SEED, SEED + 1]
+    assert capsys.readouterr().err.count(f"{path}, line 1 is damaged: ") == 1
+    assert reports(output) == alone
+
+
+def test_a_damaged_record_is_told(policy: Path, tmp_path: Path) -> None:
+    output = tmp_path / "eval"
+    play(policy, output, shards=3, shard=0)
+    (tmp_path / "eval.partial/run.json").write_text("{")
+    before = listing(tmp_path)
+    with pytest.raises(
+        ValueError, match=r"run\.json is not valid JSON.*; what is in .*eval\.partial is not known: delete it"
+    ):
+        play(policy, output, shards=3, shard=0)
+    assert listing(tmp_path) == before
+
+
+def test_the_experts_cache_costs_time_and_nothing_else(
+    policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    play(policy, tmp_path / "first")
+    (folder,) = (tmp_path / "cache/hdril/expert").iterdir()
+    kept = listing(folder)
+    (folder / f"{SEED}.npz").write_bytes(b"power cut")
+    (folder / f"{SEED + 1}.npz").write_bytes(kept[f"{SEED + 1}.npz"][:900])
+    play(policy, tmp_path / "second")
+    assert listing(folder) == kept, "made again"
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))  # no folder can be made in it
+    play(policy, tmp_path / "third")
+    assert reports(tmp_path / "first") == reports(tmp_path / "second") == reports(tmp_path / "third")
+
+
 def test_a_suite_in_shards(policy: Path, tmp_path: Path, played: list[int]) -> None:
     options = {"suite": "factors", "cells": "push", "num_episodes": 2}
     play(policy, tmp_path / "alone", **options)

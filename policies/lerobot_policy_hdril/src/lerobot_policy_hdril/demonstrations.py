@@ -115,14 +115,14 @@ def _read_columns(root: Path, subtask_key: str) -> tuple[dict[str, np.ndarray], 
 def _read_words(root: Path, table: pyarrow.Table, episodes: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Labels and starts (N,), and the primitives, from LeRobot's language rows; every frame of an episode holds them all.
 
-    Primitives are numbered as in :data:`SUBTASKS_PATH`, or in the order in which they first appear.
+    The words are what counts, because :data:`SUBTASKS_PATH` may be older: those that it names come first, in its order, then the
+    others as they first appear.
     """
     first = np.flatnonzero(np.diff(episodes, prepend=-1) != 0)
     begins = [_begins(root, int(episodes[at]), table.column(LANGUAGE)[int(at)].as_py()) for at in first]
-    if (root / SUBTASKS_PATH).exists():
-        primitives = read_primitives(root)
-    else:
-        primitives = list(dict.fromkeys(name for episode in begins for _, name in episode))
+    words = dict.fromkeys(name for episode in begins for _, name in episode)
+    named = read_primitives(root) if (root / SUBTASKS_PATH).exists() else ()
+    primitives = [name for name in dict.fromkeys((*named, *words)) if name in words]
     time, label = table.column("timestamp").to_numpy(), np.zeros(len(episodes), np.int64)
     start = np.zeros(len(episodes), bool)
     for begin, end, episode in zip(first, [*first[1:], len(episodes)], begins, strict=True):
@@ -131,8 +131,6 @@ def _read_words(root: Path, table: pyarrow.Table, episodes: np.ndarray) -> tuple
         where = f"{root}, episode {episodes[begin]}: its rows of the style {LANGUAGE_STYLE!r}"
         if frames[0] > 0 or frames[-1] >= end - begin or (np.diff(frames) <= 0).any():
             raise ValueError(f"{where} must begin with the first frame, and no two at the same")
-        if unknown := [name for _, name in episode if name not in primitives]:
-            raise ValueError(f"{where} name {unknown[0]!r}, which is not in {SUBTASKS_PATH}")
         start[begin + frames] = True
         counts = np.diff([*frames, end - begin])
         label[begin:end] = np.repeat([primitives.index(name) for _, name in episode], counts)
