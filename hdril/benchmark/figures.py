@@ -1,8 +1,8 @@
-"""The figures of a benchmark: success with its interval, and success over demonstrations."""
+"""The figures of a benchmark: success with its interval, and success over demonstrations and over minutes of training."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -16,12 +16,26 @@ MARKERS = "osD^v<>P"
 
 
 def figures(table: Mapping[str, Any]) -> dict[str, Figure]:
-    """The figures of a table of ``benchmark.json``, by what they show: ``success``; ``demonstrations``, where there are rows
-    of more than one number of demonstrations."""
+    """The figures of a table of ``benchmark.json``, by what they show: ``success``; ``demonstrations`` and ``minutes``, where
+    there are rows of more than one number of demonstrations, or of more than one budget of training."""
     found = {"success": _success(table)}
     if len({row["demonstrations"] for row in table["rows"]}) > 1:
-        found["demonstrations"] = _over_demonstrations(table)
+        found["demonstrations"] = _curves(table, "demonstrations", "demonstrations", _counts)
+    if len({row["minutes"] for row in table["rows"]} - {None}) > 1:
+        found["minutes"] = _curves(table, "minutes", "minutes of training", lambda row: row["training_minutes"])
     return found
+
+
+def _counts(row: Mapping[str, Any]) -> list[int]:
+    """Demonstrations of each training of a row."""
+    return [row["demonstrations"]] * len(row["training_minutes"])
+
+
+def _name(row: Mapping[str, Any], *, without: str = "") -> str:
+    """What tells a row from others of its table, but for one of its numbers."""
+    counted = row["data"] if without == "demonstrations" else f"{row['demonstrations']} of {row['data']}"
+    minutes = "" if without == "minutes" or row["minutes"] is None else f", {row['minutes']:g} min"
+    return f"{row['policy']}{minutes}, {counted}"
 
 
 def _success(table: Mapping[str, Any]) -> Figure:
@@ -33,7 +47,7 @@ def _success(table: Mapping[str, Any]) -> Figure:
     axes = figure.subplots()
     labels = []
     for place, row in enumerate(rows):
-        labels.append(f"{row['policy']}, {row['demonstrations']} of {row['data']}")
+        labels.append(_name(row))
         for number, name in enumerate(names):
             y = place + (number - (len(names) - 1) / 2) * 0.8 / len(names)
             _mark(axes, row["cells"][name], y, number, name if place == 0 else None)
@@ -54,28 +68,38 @@ def _mark(axes: Axes, runs: Sequence[Mapping[str, Any]], y: float, number: int, 
         axes.plot([run["pc_success"]], [at], marker, color=colour, markersize=4.0, label=label if i == 0 else None)
 
 
-def _over_demonstrations(table: Mapping[str, Any]) -> Figure:
-    """A panel for each evaluation, a curve for each policy: the mean over trainings, and a mark for each training."""
+def _curves(
+    table: Mapping[str, Any], key: str, label: str, places: Callable[[Mapping[str, Any]], Sequence[float]]
+) -> Figure:
+    """A panel for each evaluation, a curve for each policy: the mean over trainings, and a mark for each training.
+
+    Args:
+        key: the number by which the rows of a curve differ.
+        label: of the axis.
+        places: where on it the trainings of a row are.
+    """
     from matplotlib.figure import Figure
 
     names = list(table["evaluations"])
-    policies = list(dict.fromkeys((row["policy"], row["data"]) for row in table["rows"]))
+    curves: dict[str, list[Mapping[str, Any]]] = {}
+    for row in sorted(table["rows"], key=lambda row: row[key] or 0.0):
+        curves.setdefault(_name(row, without=key), []).append(row)
+    order = dict.fromkeys(_name(row, without=key) for row in table["rows"])
     figure = Figure(figsize=(1.0 + 3.2 * len(names), 3.2), layout="constrained")
     panels = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
     for panel, name in zip(panels, names, strict=True):
-        for number, (policy, data) in enumerate(policies):
-            rows = [row for row in table["rows"] if (row["policy"], row["data"]) == (policy, data)]
-            rows.sort(key=lambda row: row["demonstrations"])
-            counts = [row["demonstrations"] for row in rows]
-            rates = [[run["pc_success"] for run in row["cells"][name]] for row in rows]
+        for number, curve in enumerate(order):
+            at = [places(row) for row in curves[curve]]
+            rates = [[run["pc_success"] for run in row["cells"][name]] for row in curves[curve]]
             colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
             means = [sum(each) / len(each) for each in rates]
-            panel.plot(counts, means, color=colour, marker=marker, markersize=4.5, label=f"{policy}, {data}")
-            for count, each in zip(counts, rates, strict=True):
-                panel.plot([count] * len(each), each, marker, color=colour, markersize=2.5, alpha=0.6)
-        panel.set(xscale="log", xlabel="demonstrations", title=name, ylim=(-2, 102))
-        panel.set_xticks(sorted({row["demonstrations"] for row in table["rows"]}))
-        panel.get_xaxis().set_major_formatter("{x:.0f}")
+            centres = [sum(each) / len(each) for each in at]
+            panel.plot(centres, means, color=colour, marker=marker, markersize=4.5, label=curve)
+            for place, each in zip(at, rates, strict=True):
+                panel.plot(place, each, marker, color=colour, markersize=2.5, alpha=0.6)
+        panel.set(xscale="log", xlabel=label, title=name, ylim=(-2, 102))
+        panel.set_xticks(sorted({row[key] for row in table["rows"] if row[key]}))
+        panel.get_xaxis().set_major_formatter("{x:g}")
         panel.minorticks_off()
         panel.grid(alpha=0.3)
     panels[0].set_ylabel("success, %")

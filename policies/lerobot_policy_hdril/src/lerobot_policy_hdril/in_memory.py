@@ -18,8 +18,9 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from datasets import Dataset
     from lerobot.configs.train import TrainPipelineConfig
+
+    from datasets import Dataset
 
 
 class FramesInMemory:
