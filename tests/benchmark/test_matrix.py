@@ -14,11 +14,12 @@ from typing import Any
 import draccus
 import numpy as np
 import pytest
+from lerobot.configs.train import TrainPipelineConfig
 
 from hdril.benchmark.calibrate import Speed
 from hdril.benchmark.engine import in_order
 from hdril.benchmark.figures import figures
-from hdril.benchmark.matrix import Matrix, check, rows, steps
+from hdril.benchmark.matrix import Matrix, check, check_held_out, rows, steps
 from hdril.benchmark.page import write_report
 from hdril.benchmark.report import markdown
 from hdril.benchmark.results import collect
@@ -213,12 +214,42 @@ def test_there_must_be_a_config_file() -> None:
         check(changed(lambda values: values["policies"]["act"].update(config="nowhere.yaml")))
 
 
-@pytest.mark.parametrize("file", sorted((ROOT / "configs/benchmark").glob("*.yaml")), ids=lambda file: file.stem)
+FILES = sorted((ROOT / "configs/benchmark").glob("*.yaml"))
+
+
+def read(file: Path) -> BenchmarkConfig:
+    return draccus.parse(BenchmarkConfig, args=[f"--config_path={file}"])
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_the_benchmarks_of_this_repository_can_be(file: Path) -> None:
-    config = draccus.parse(BenchmarkConfig, args=[f"--config_path={file}"])
+    config = read(file)
     check(config)
     assert config.name == file.stem
     assert steps(config)
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_lerobot_knows_the_options_of_their_policies(file: Path) -> None:
+    for name, policy in read(file).policies.items():
+        known = draccus.parse(TrainPipelineConfig, policy.config, args=policy.options)
+        assert known.policy is not None, name
+        assert known.policy.device == "cpu", name
+
+
+def test_no_benchmark_reports_seeds_that_another_one_tunes_on() -> None:
+    matrices = [read(file) for file in FILES]
+    tuned = {
+        name: entry
+        for matrix in matrices
+        for name, entry in matrix.evaluations.items()
+        if matrix.tuning and entry.tuning
+    }
+    assert tuned
+    for matrix in matrices:
+        if not matrix.tuning:
+            theirs = {f"{name}, tuned": entry for name, entry in tuned.items()}
+            check_held_out(replace(matrix, evaluations=matrix.evaluations | theirs))
 
 
 # ---------------------------------------------------------------- what was found
