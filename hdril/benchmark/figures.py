@@ -1,4 +1,5 @@
-"""The figures of a benchmark: success with its interval, and success over demonstrations and over minutes of training."""
+"""The figures of a benchmark: success with its interval, and success over demonstrations and over minutes of training, and
+what was learned from."""
 
 from __future__ import annotations
 
@@ -17,13 +18,42 @@ MARKERS = "osD^v<>P"
 
 def figures(table: Mapping[str, Any]) -> dict[str, Figure]:
     """The figures of a table of ``benchmark.json``, by what they show: ``success``; ``demonstrations`` and ``minutes``, where
-    there are rows of more than one number of demonstrations, or of more than one budget of training."""
+    there are rows of more than one number of demonstrations, or of more than one budget of training; ``trajectories`` of
+    demonstrations, where the table has them."""
     found = {"success": _success(table)}
     if len({row["demonstrations"] for row in table["rows"]}) > 1:
         found["demonstrations"] = _curves(table, "demonstrations", "demonstrations", _counts)
     if len({row["minutes"] for row in table["rows"]} - {None}) > 1:
         found["minutes"] = _curves(table, "minutes", "minutes of training", lambda row: row["training_minutes"])
+    if any(table["trajectories"].values()):
+        found["trajectories"] = _trajectories(table["trajectories"])
     return found
+
+
+def _trajectories(recorded: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+    """A panel for each data set: where the hands go in each demonstration, m, and one of them highlighted."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(0.4 + 4.2 * len(recorded), 3.8), layout="constrained")
+    for number, (name, episodes) in enumerate(recorded.items(), 1):
+        axes: Any = figure.add_subplot(1, len(recorded), number, projection="3d")
+        chosen = len(episodes) // 2
+        for i, episode in enumerate(episodes):
+            for colour, marker, (side, places) in zip(COLOURS, MARKERS, episode.items(), strict=False):
+                path = tuple(zip(*places, strict=True))
+                if i != chosen:
+                    axes.plot(*path, color=colour, linewidth=0.6, alpha=0.5)
+                    continue
+                label = f"{side} hand"
+                axes.plot(*path, color=colour, linewidth=2.2, marker=marker, markevery=[0], zorder=10, label=label)
+        axes.set(xlabel="x, m", ylabel="y, m", zlabel="z, m")
+        axes.locator_params(nbins=4)
+        axes.locator_params(axis="z", nbins=2)
+        axes.set_title(f"{len(episodes)} of {name}; highlighted: {chosen}", fontsize=9)
+        axes.set_aspect("equal")
+        axes.tick_params(labelsize=7)
+    axes.legend(fontsize=8, frameon=False, loc="upper left")
+    return figure
 
 
 def _counts(row: Mapping[str, Any]) -> list[int]:
@@ -85,7 +115,8 @@ def _curves(
     for row in sorted(table["rows"], key=lambda row: row[key] or 0.0):
         curves.setdefault(_name(row, without=key), []).append(row)
     order = dict.fromkeys(_name(row, without=key) for row in table["rows"])
-    figure = Figure(figsize=(1.0 + 3.2 * len(names), 3.2), layout="constrained")
+    legend = 0.5 + 0.07 * max(map(len, order))  # inches beside the panels, at 8 points a letter
+    figure = Figure(figsize=(0.6 + 3.2 * len(names) + legend, 3.2), layout="constrained")
     panels = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
     for panel, name in zip(panels, names, strict=True):
         for number, curve in enumerate(order):

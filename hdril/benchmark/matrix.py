@@ -95,6 +95,8 @@ class TableSpec:
     """The policy that the others are compared with, on the same demonstrations and seeds."""
     errors: list[str] = field(default_factory=list)
     """Errors against the expert that are shown beside success: position_error_cm, angle_error_rad, dtw_cm."""
+    trajectories: int = 0
+    """How many of the demonstrations are drawn, the first ones, with one of them highlighted."""
     published: dict[str, str] = field(default_factory=dict)
     """Numbers of others beside ours, as text, by policy."""
     published_by: str = "published"
@@ -246,6 +248,8 @@ def _check_table(matrix: Matrix, table: TableSpec) -> None:
         most = matrix.data[name].episodes
         if wrong := [count for count in table.demonstrations if not 1 <= count <= most]:
             raise ValueError(f"table {table.title!r}: data {name} has 1 to {most} demonstrations, got {wrong[0]}")
+        if not 0 <= table.trajectories <= most:
+            raise ValueError(f"table {table.title!r}: trajectories must be from 0 to {most}, got {table.trajectories}")
         task = base_name(matrix.data[name].task)
         if other := [key for key in table.evaluations if base_name(matrix.evaluations[key].task) != task]:
             raise ValueError(f"table {table.title!r}: evaluation {other[0]} is not of {task}, the task of data {name}")

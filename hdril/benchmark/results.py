@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from hdril.benchmark.engine import in_order
 from hdril.benchmark.matrix import EvaluationSpec, Matrix, Row, TableSpec, rows, steps
 from hdril.benchmark.steps import Evaluate
 from hdril.benchmark.store import Store
+from hdril.demonstrations.read import read_episode
 from hdril.evaluation.statistics import (
     bootstrap_difference,
     holm,
@@ -22,6 +24,8 @@ from hdril.evaluation.statistics import (
     paired_difference_interval,
 )
 from hdril.evaluation.stored import read_evaluation
+from hdril.simulation.actions import hand_poses
+from hdril.simulation.robots.spec import SIDES
 
 _KEPT = ("n_episodes", "n_success", "pc_success", "pc_success_ci95", "held_out", "position_error_cm", "angle_error_rad",
          "dtw_cm", "stages_reached")  # fmt: skip
@@ -44,7 +48,9 @@ def collect(matrix: Matrix, store: Store) -> dict[str, Any]:
 
 
 def _table(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
-    found = [_row(row, store) for row in rows(matrix, table)]
+    wanted = list(rows(matrix, table))
+    found = [_row(row, store) for row in wanted]
+    recorded = {row.data: row.trainings[0].data for row in wanted}
     return {
         "title": table.title,
         "note": table.note,
@@ -56,7 +62,17 @@ def _table(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
         "published": table.published,
         "published_by": table.published_by,
         "tests": _tests(matrix, table, found),
+        "trajectories": {
+            name: [_hands(store.get(step).output, episode) for episode in range(table.trajectories)]
+            for name, step in recorded.items()
+        },
     }
+
+
+def _hands(dataset: Path, episode: int) -> dict[str, list[list[float]]]:
+    """Where each hand is in an episode, by side: a list of x, y, z in m, to the millimetre, for each frame."""
+    places = hand_poses(read_episode(dataset, episode).state)[..., :3]
+    return {side: places[:, i].round(3).tolist() for i, side in enumerate(SIDES)}
 
 
 def _row(row: Row, store: Store) -> dict[str, Any]:

@@ -26,6 +26,7 @@ from hdril.benchmark.results import collect
 from hdril.benchmark.steps import Calibrate, Evaluate, Step
 from hdril.benchmark.store import Store
 from hdril.cli.benchmark import BenchmarkConfig, benchmark_command
+from hdril.demonstrations.read import read_episode
 from hdril.digest import digest_json
 from hdril.evaluation.results import Run, summarise
 from hdril.execution import SlurmConfig
@@ -138,6 +139,7 @@ def test_a_change_of_hdril_does_not_touch_what_it_does_not_make(monkeypatch: pyt
         (lambda v: v["tables"][0].update(evaluations=[]), "names no evaluations; choose from: nominal, varied"),
         (lambda v: v["tables"][0].update(training_seeds=[]), "names no training_seeds"),
         (lambda v: v["tables"][0].update(demonstrations=[51]), "data nominal has 1 to 50 demonstrations, got 51"),
+        (lambda v: v["tables"][0].update(trajectories=51), "trajectories must be from 0 to 50, got 51"),
         (lambda v: v["tables"][0].update(training_seeds=[1, 1]), "training_seeds has 1 twice"),
         (lambda v: v["tables"][0].update(demonstrations=[50, 50]), "demonstrations has 50 twice"),
         (lambda v: v["tables"][0].update(policies=["hdril", "hdril"]), "policies has 'hdril' twice"),
@@ -503,6 +505,27 @@ def test_minutes_and_steps_are_reported_and_compared_like_with_like(tmp_path: Pa
     assert labels[1:3] == ["act, 10 min, 50 of varied", "act, 60 min, 50 of varied"]
 
 
+def test_demonstrations_are_drawn_and_one_of_them_is_highlighted(dataset: Path, tmp_path: Path) -> None:
+    matrix = changed(lambda values: (one_row(values), values["tables"][0].update(trajectories=3)))
+    store = Store(tmp_path / "store")
+    pretend(store, matrix, fails)
+    output = store.get(steps(matrix)[0].policy.data).output
+    output.rmdir()
+    output.symlink_to(dataset)
+    (table,) = collect(matrix, store)["tables"]
+    ((name, episodes),) = table["trajectories"].items()
+    assert name == "varied"
+    state = read_episode(dataset, 2).state
+    np.testing.assert_allclose(episodes[2]["left"], state[:, :3], atol=6e-4)
+    np.testing.assert_allclose(episodes[2]["right"], state[:, 8:11], atol=6e-4)
+    lines = figures(table)["trajectories"].axes[0].get_lines()
+    widths = [line.get_linewidth() for line in lines]
+    assert len(lines) == 3 * 2
+    assert [i for i, width in enumerate(widths) if width == max(widths)] == [2, 3], "both hands of the second episode"
+    plain = changed(one_row)
+    assert "trajectories" not in figures(collect(plain, store)["tables"][0])
+
+
 def test_a_report_for_tuning_says_so(tmp_path: Path) -> None:
     def tune(values: dict[str, Any]) -> None:
         one_row(values)
@@ -514,7 +537,8 @@ def test_a_report_for_tuning_says_so(tmp_path: Path) -> None:
         (one_row, "No seed of an evaluation was trained or tuned on."),
     ):
         matrix, store = changed(change), Store(tmp_path / "store")
-        pretend(store, matrix, fails) if change is tune else None
+        if change is tune:
+            pretend(store, matrix, fails)
         assert words in markdown(collect(matrix, store))
 
 
