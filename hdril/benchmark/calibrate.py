@@ -60,25 +60,27 @@ def measure(command: Sequence[str], warm_up: float, measured: float) -> Speed:
         ValueError: the training ended before.
     """
     begun = time.monotonic()
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-    assert process.stdout is not None
-    try:
-        count, first, warm = 0, None, None
-        for line in process.stdout:
-            if not _STEP.search(line):
-                sys.stdout.buffer.write(line)
-                sys.stdout.flush()
-                continue
-            count, now = count + 1, time.monotonic()
-            first = first or now
-            if warm is None:
-                warm = (count, now) if now - first >= warm_up else None
-            elif now - warm[1] >= measured:
-                steps, since = warm
-                return Speed(steps, round(since - begun, 3), round((now - since) / (count - steps), 6))
-    finally:
-        process.kill()
-        code = process.wait()
+    count, first, warm = 0, None, None
+    with subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    ) as process:
+        assert process.stdout is not None
+        try:
+            for line in process.stdout:
+                if not _STEP.search(line):
+                    sys.stdout.buffer.write(line)
+                    sys.stdout.flush()
+                    continue
+                count, now = count + 1, time.monotonic()
+                first = first or now
+                if warm is None:
+                    warm = (count, now) if now - first >= warm_up else None
+                elif now - warm[1] >= measured:
+                    steps, since = warm
+                    return Speed(steps, round(since - begun, 3), round((now - since) / (count - steps), 6))
+            code = process.wait()
+        finally:
+            process.kill()
     raise ValueError(f"the training ended with exit code {code} after {count} steps: it is too short, or it failed")
 
 

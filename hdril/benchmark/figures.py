@@ -52,7 +52,7 @@ def _trajectories(recorded: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure
         axes.set_title(f"{len(episodes)} of {name}; highlighted: {chosen}", fontsize=9)
         axes.set_aspect("equal")
         axes.tick_params(labelsize=7)
-    axes.legend(fontsize=8, frameon=False, loc="upper left")
+    figure.axes[-1].legend(fontsize=8, frameon=False, loc="upper left")
     return figure
 
 
