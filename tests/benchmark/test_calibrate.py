@@ -20,7 +20,8 @@ time.sleep(float(start))
 for step in range(1, 100_000):
     time.sleep(float(first) if step <= 3 else float(other))
     print(f"\\rTraining: 0%INFO 2026-01-01 in.py:1 step:{step if step < 1000 else '1K'} smpl:64 loss:0.1", flush=True)
-    Path(started).write_text(str(step))
+    with Path(started).open("a") as file:
+        file.write("step\\n")
 """
 
 
@@ -34,9 +35,9 @@ def test_what_happens_once_is_left_out_of_the_speed_and_in_the_budget(tmp_path: 
     assert speed.warm_steps >= 4
     assert speed.warm_seconds >= 1.0 + 3 * 0.4
     assert 0.02 <= speed.step_seconds < 0.2, "a step of 0.4 s would show"
-    last = int((tmp_path / "steps").read_text())
+    begun = (tmp_path / "steps").read_text()
     time.sleep(0.3)
-    assert int((tmp_path / "steps").read_text()) == last, "the training is stopped"
+    assert (tmp_path / "steps").read_text() == begun, "the training is stopped"
 
 
 def test_steps_are_those_that_are_over_by_then() -> None:
