@@ -19,7 +19,7 @@ MARKERS = "osD^v<>P"
 def figures(table: Mapping[str, Any]) -> dict[str, Figure]:
     """The figures of a table of ``benchmark.json``, by what they show: ``success``; ``demonstrations`` and ``minutes``, where
     there are rows of more than one number of demonstrations, or of more than one budget of training; ``trajectories`` of
-    demonstrations, where the table has them."""
+    demonstrations and a held-out ``episode``, where the table has them."""
     found = {"success": _success(table)}
     if len({row["demonstrations"] for row in table["rows"]}) > 1:
         found["demonstrations"] = _curves(table, "demonstrations", "demonstrations", _counts)
@@ -27,7 +27,31 @@ def figures(table: Mapping[str, Any]) -> dict[str, Figure]:
         found["minutes"] = _curves(table, "minutes", "minutes of training", lambda row: row["training_minutes"])
     if any(table["trajectories"].values()):
         found["trajectories"] = _trajectories(table["trajectories"])
+    if table["episodes"]:
+        found["episode"] = _episode(table["episodes"])
     return found
+
+
+def _episode(episodes: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """A column for each evaluation, a panel for each hand: its coordinates as predicted, and as the expert has them."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(1.2 + 3.6 * len(episodes), 4.4), layout="constrained")
+    panels = figure.subplots(2, len(episodes), squeeze=False, sharex="col", sharey=True)
+    for column, (name, episode) in zip(panels.T, episodes.items(), strict=True):
+        for panel, side in zip(column, episode["true"], strict=True):
+            for i, axis in enumerate("xyz"):
+                predicted, true = ([place[i] for place in episode[key][side]] for key in ("predicted", "true"))
+                panel.plot(true, color="0.6", linewidth=3.0, label="the expert" if i == 0 else None)
+                panel.plot(predicted, color=COLOURS[i], marker=MARKERS[i], markevery=8, markersize=3.5, linewidth=1.2,
+                           label=f"{axis}, predicted")  # fmt: skip
+            panel.set_ylabel(f"{side} hand, m")
+            panel.grid(alpha=0.3)
+        ended = "success" if episode["success"] else "failure"
+        column[0].set_title(f"{name}, seed {episode['seed']}: {ended}\n{episode['title']}", fontsize=8)
+        column[-1].set_xlabel("frame")
+    panels[0, -1].legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
 
 
 def _trajectories(recorded: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:

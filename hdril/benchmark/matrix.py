@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
 
-from hdril.benchmark.steps import Evaluate, Record, Train
+from hdril.benchmark.steps import Evaluate, Play, Record, Step, Train
 from hdril.demonstrations.record import PATIENCE
 from hdril.files import MAX_SEED
 from hdril.tasks import base_name, get_task
@@ -97,6 +97,9 @@ class TableSpec:
     """Errors against the expert that are shown beside success: position_error_cm, angle_error_rad, dtw_cm."""
     trajectories: int = 0
     """How many of the demonstrations are drawn, the first ones, with one of them highlighted."""
+    episode: int = -1
+    """A seed of the evaluations that is drawn: the first training of ``against``, or else of the first policy, with the most
+    minutes and demonstrations, on the first data. None unless given."""
     published: dict[str, str] = field(default_factory=dict)
     """Numbers of others beside ours, as text, by policy."""
     published_by: str = "published"
@@ -172,6 +175,21 @@ def steps(matrix: Matrix) -> list[Evaluate]:
     return list(found)
 
 
+def drawn(matrix: Matrix, table: TableSpec) -> dict[str, Play]:
+    """The episodes that are drawn, by evaluation."""
+    if table.episode < 0:
+        return {}
+    policy = table.against or table.policies[0]
+    candidates = [row for row in rows(matrix, table) if (row.data, row.policy) == (table.data[0], policy)]
+    row = max(candidates, key=lambda row: (row.minutes or 0.0, row.demonstrations))
+    return {name: Play(evaluated[0], table.episode) for name, evaluated in row.evaluations.items()}
+
+
+def all_steps(matrix: Matrix) -> list[Step]:
+    """All that the report of a matrix is made of: the evaluations, and the episodes that are drawn."""
+    return [*steps(matrix), *(step for table in matrix.tables for step in drawn(matrix, table).values())]
+
+
 def check(matrix: Matrix) -> None:
     """Check a matrix; nothing is done.
 
@@ -244,6 +262,11 @@ def _check_table(matrix: Matrix, table: TableSpec) -> None:
     _check_once(table, "demonstrations", table.demonstrations)
     if not table.training_seeds:
         raise ValueError(f"table {table.title!r} names no training_seeds")
+    for name in table.evaluations if table.episode >= 0 else []:
+        if table.episode not in (seeds := _seeds(matrix.evaluations[name])):
+            raise ValueError(
+                f"table {table.title!r}: episode must be a seed of {name}, {seeds.start} to {seeds[-1]}, got {table.episode}"
+            )
     for name in table.data:
         most = matrix.data[name].episodes
         if wrong := [count for count in table.demonstrations if not 1 <= count <= most]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,10 +11,12 @@ from numpy.typing import NDArray
 
 from hdril import __version__
 from hdril.benchmark.engine import in_order
-from hdril.benchmark.matrix import EvaluationSpec, Matrix, Row, TableSpec, rows, steps
+from hdril.benchmark.episode import EPISODE, places
+from hdril.benchmark.matrix import EvaluationSpec, Matrix, Row, TableSpec, all_steps, drawn, rows
 from hdril.benchmark.steps import Evaluate
 from hdril.benchmark.store import Store
 from hdril.demonstrations.read import read_episode
+from hdril.evaluation.checkpoint import read_json
 from hdril.evaluation.statistics import (
     bootstrap_difference,
     holm,
@@ -24,8 +25,6 @@ from hdril.evaluation.statistics import (
     paired_difference_interval,
 )
 from hdril.evaluation.stored import read_evaluation
-from hdril.simulation.actions import hand_poses
-from hdril.simulation.robots.spec import SIDES
 
 _KEPT = ("n_episodes", "n_success", "pc_success", "pc_success_ci95", "held_out", "position_error_cm", "angle_error_rad",
          "dtw_cm", "stages_reached")  # fmt: skip
@@ -42,7 +41,7 @@ def collect(matrix: Matrix, store: Store) -> dict[str, Any]:
         "name": matrix.name,
         "tuning": matrix.tuning,
         "hdril_version": __version__,
-        "machines": sorted({store.get(step).machine for step in in_order(steps(matrix))}),
+        "machines": sorted({store.get(step).machine for step in in_order(all_steps(matrix))}),
         "tables": [_table(matrix, table, store) for table in matrix.tables],
     }
 
@@ -63,16 +62,14 @@ def _table(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
         "published_by": table.published_by,
         "tests": _tests(matrix, table, found),
         "trajectories": {
-            name: [_hands(store.get(step).output, episode) for episode in range(table.trajectories)]
+            name: [places(read_episode(store.get(step).output, number).state) for number in range(table.trajectories)]
             for name, step in recorded.items()
         },
+        "episodes": {
+            name: read_json(store.get(step).output / EPISODE) | {"title": step.evaluation.policy.title}
+            for name, step in drawn(matrix, table).items()
+        },
     }
-
-
-def _hands(dataset: Path, episode: int) -> dict[str, list[list[float]]]:
-    """Where each hand is in an episode, by side: a list of x, y, z in m, to the millimetre, for each frame."""
-    places = hand_poses(read_episode(dataset, episode).state)[..., :3]
-    return {side: places[:, i].round(3).tolist() for i, side in enumerate(SIDES)}
 
 
 def _row(row: Row, store: Store) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import Any
 import yaml
 
 from hdril.benchmark.calibrate import SPEED, Speed
+from hdril.benchmark.episode import EPISODE
 from hdril.demonstrations.provenance import read_provenance
 from hdril.digest import digest_file, digest_files, digest_json
 from hdril.evaluation.checkpoint import Checkpoint, read_json
@@ -282,3 +283,34 @@ class Evaluate(Step):
     def digest(self, output: Path) -> str:
         read_json(output / RESULTS)  # it is whole
         return digest_file(output / RESULTS)
+
+
+@dataclass(frozen=True)
+class Play(Step):
+    """One seed of an evaluation, frame by frame, to be drawn."""
+
+    evaluation: Evaluate
+    seed: int
+
+    kind = "play"
+    resumes = False
+
+    @property
+    def title(self) -> str:
+        return f"{self.evaluation.title}, seed {self.seed}"
+
+    @property
+    def inputs(self) -> Mapping[str, Step]:
+        return self.evaluation.inputs
+
+    def settings(self) -> dict[str, Any]:
+        return self.evaluation.settings() | {"seed": self.seed}
+
+    def command(self, output: Path, inputs: Folders) -> list[str]:
+        checkpoint = self.evaluation.policy.checkpoint(inputs["policy"])
+        options = [option for option in self.evaluation.options if option.startswith(("--policy.", "--max_frames="))]
+        return ["python", "-m", "hdril.benchmark.episode", f"--policy={checkpoint}", f"--task={self.evaluation.task}",
+                f"--seed={self.seed}", f"--output={output}", *options]  # fmt: skip
+
+    def digest(self, output: Path) -> str:
+        return digest_json(read_json(output / EPISODE))

@@ -19,11 +19,11 @@ from lerobot.configs.train import TrainPipelineConfig
 from hdril.benchmark.calibrate import Speed
 from hdril.benchmark.engine import in_order
 from hdril.benchmark.figures import figures
-from hdril.benchmark.matrix import Matrix, check, check_held_out, rows, steps
+from hdril.benchmark.matrix import Matrix, all_steps, check, check_held_out, rows, steps
 from hdril.benchmark.page import write_report
 from hdril.benchmark.report import markdown
 from hdril.benchmark.results import collect
-from hdril.benchmark.steps import Calibrate, Evaluate, Step
+from hdril.benchmark.steps import Calibrate, Evaluate, Play, Step
 from hdril.benchmark.store import Store
 from hdril.cli.benchmark import BenchmarkConfig, benchmark_command
 from hdril.demonstrations.read import read_episode
@@ -139,6 +139,7 @@ def test_a_change_of_hdril_does_not_touch_what_it_does_not_make(monkeypatch: pyt
         (lambda v: v["tables"][0].update(evaluations=[]), "names no evaluations; choose from: nominal, varied"),
         (lambda v: v["tables"][0].update(training_seeds=[]), "names no training_seeds"),
         (lambda v: v["tables"][0].update(demonstrations=[51]), "data nominal has 1 to 50 demonstrations, got 51"),
+        (lambda v: v["tables"][0].update(episode=SEED + COUNT), "episode must be a seed of nominal, 600000 to 600007"),
         (lambda v: v["tables"][0].update(trajectories=51), "trajectories must be from 0 to 50, got 51"),
         (lambda v: v["tables"][0].update(training_seeds=[1, 1]), "training_seeds has 1 twice"),
         (lambda v: v["tables"][0].update(demonstrations=[50, 50]), "demonstrations has 50 twice"),
@@ -259,7 +260,7 @@ def test_no_benchmark_reports_seeds_that_another_one_tunes_on() -> None:
 
 def pretend(store: Store, matrix: Matrix, failed: Callable[[Evaluate], set[int]]) -> None:
     """Fill a store as if all had been done: ``failed`` seeds by evaluation."""
-    for step in in_order(steps(matrix)):
+    for step in in_order(all_steps(matrix)):
         place = store.place(step)
         assert place is not None
         (place / "result").mkdir(parents=True)
@@ -272,8 +273,18 @@ def pretend(store: Store, matrix: Matrix, failed: Callable[[Evaluate], set[int]]
             run = Run(step.task, "policy", (), step.first_seed, step.episodes, True, "compared")
             results = summarise(run, outcomes) | {"identity": {"policy": {"weights": digest_json(step.policy.title)}}}
             (place / "result/results.json").write_text(json.dumps(results))
+        if isinstance(step, Play):
+            (place / "result/episode.json").write_text(json.dumps(EPISODE))
         if isinstance(step, Calibrate):
             (place / "result/speed.json").write_text(json.dumps(vars(SPEEDS[step.training.name])))
+
+
+EPISODE = {
+    "seed": SEED,
+    "success": False,
+    "predicted": {"left": [[0.1, 0.2, 0.3], [0.2, 0.2, 0.3]], "right": [[0.1, -0.2, 0.3], [0.2, -0.2, 0.3]]},
+    "true": {"left": [[0.1, 0.2, 0.4]], "right": [[0.1, -0.2, 0.5]]},
+}
 
 
 SPEEDS = {"act": Speed(100, 60.0, 0.25), "hdril": Speed(200, 50.0, 0.5)}
@@ -524,6 +535,31 @@ def test_demonstrations_are_drawn_and_one_of_them_is_highlighted(dataset: Path, 
     assert [i for i, width in enumerate(widths) if width == max(widths)] == [2, 3], "both hands of the second episode"
     plain = changed(one_row)
     assert "trajectories" not in figures(collect(plain, store)["tables"][0])
+
+
+def test_a_held_out_episode_of_the_policy_that_matters_is_drawn(tmp_path: Path) -> None:
+    def draw(values: dict[str, Any]) -> None:
+        by_minutes(values)
+        values["tables"][0].update(episode=SEED, demonstrations=[10, 50])
+        values["evaluations"]["varied"]["options"] = ["--policy.rollout=open_loop", "--max_frames=9", "--device=cpu"]
+
+    matrix, store = changed(draw), Store(tmp_path / "store")
+    (play,) = [step for step in all_steps(matrix) if isinstance(step, Play)]
+    trained = play.evaluation.policy
+    assert (trained.name, trained.minutes, trained.episodes, trained.seed) == ("hdril", 60.0, 50, 1)
+    assert play.command(Path("out"), {"policy": Path("run")}) == [
+        "python", "-m", "hdril.benchmark.episode", "--policy=run/checkpoints/last/pretrained_model",
+        "--task=table_lift:level=varied", f"--seed={SEED}", "--output=out", "--policy.rollout=open_loop", "--max_frames=9",
+    ]  # fmt: skip
+    pretend(store, matrix, fails)
+    (table,) = collect(matrix, store)["tables"]
+    left, right = figures(table)["episode"].axes
+    assert left.get_title().startswith(f"varied, seed {SEED}: failure\nhdril on 50 of")
+    drawn = {str(line.get_label()): line.get_xydata() for line in right.get_lines()}
+    np.testing.assert_allclose(drawn["y, predicted"], [[0, -0.2], [1, -0.2]])
+    np.testing.assert_allclose(drawn["the expert"], [[0, 0.1]])
+    plain = changed(lambda values: (draw(values), values["tables"][0].update(episode=-1)))
+    assert "episode" not in figures(collect(plain, store)["tables"][0])
 
 
 def test_a_report_for_tuning_says_so(tmp_path: Path) -> None:
