@@ -1,8 +1,9 @@
-"""The figures of a benchmark: success with its interval, and success over demonstrations."""
+"""The figures of a benchmark: success with its interval, and success over demonstrations and over minutes of training, and
+what was learned from."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -16,12 +17,79 @@ MARKERS = "osD^v<>P"
 
 
 def figures(table: Mapping[str, Any]) -> dict[str, Figure]:
-    """The figures of a table of ``benchmark.json``, by what they show: ``success``; ``demonstrations``, where there are rows
-    of more than one number of demonstrations."""
+    """The figures of a table of ``benchmark.json``, by what they show: ``success``; ``demonstrations`` and ``minutes``, where
+    there are rows of more than one number of demonstrations, or of more than one budget of training; ``trajectories`` of
+    demonstrations and a held-out ``episode``, where the table has them."""
     found = {"success": _success(table)}
     if len({row["demonstrations"] for row in table["rows"]}) > 1:
-        found["demonstrations"] = _over_demonstrations(table)
+        found["demonstrations"] = _curves(table, "demonstrations", "demonstrations", _counts)
+    if len({row["minutes"] for row in table["rows"]} - {None}) > 1:
+        found["minutes"] = _curves(table, "minutes", "minutes of training", lambda row: row["training_minutes"])
+    if any(table["trajectories"].values()):
+        found["trajectories"] = _trajectories(table["trajectories"])
+    if table["episodes"]:
+        found["episode"] = _episode(table["episodes"])
     return found
+
+
+def _episode(episodes: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """A column for each evaluation, a panel for each hand: its coordinates as predicted, and as the expert has them."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(1.2 + 3.6 * len(episodes), 4.4), layout="constrained")
+    panels = figure.subplots(2, len(episodes), squeeze=False, sharex="col", sharey=True)
+    for column, (name, episode) in zip(panels.T, episodes.items(), strict=True):
+        for panel, side in zip(column, episode["true"], strict=True):
+            for i, axis in enumerate("xyz"):
+                predicted, true = ([place[i] for place in episode[key][side]] for key in ("predicted", "true"))
+                panel.plot(true, color="0.6", linewidth=3.0, label="the expert" if i == 0 else None)
+                panel.plot(predicted, color=COLOURS[i], marker=MARKERS[i], markevery=8, markersize=3.5, linewidth=1.2,
+                           label=f"{axis}, predicted")  # fmt: skip
+            panel.set_ylabel(f"{side} hand, m")
+            panel.grid(alpha=0.3)
+        ended = "success" if episode["success"] else "failure"
+        column[0].set_title(f"{name}, seed {episode['seed']}: {ended}\n{episode['title']}", fontsize=8)
+        column[-1].set_xlabel("frame")
+    panels[0, -1].legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def _trajectories(recorded: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+    """A panel for each data set: where the hands go in each demonstration, m, and one of them highlighted."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(0.4 + 4.2 * len(recorded), 3.8), layout="constrained")
+    for number, (name, episodes) in enumerate(recorded.items(), 1):
+        axes: Any = figure.add_subplot(1, len(recorded), number, projection="3d")
+        chosen = len(episodes) // 2
+        for i, episode in enumerate(episodes):
+            for colour, marker, (side, places) in zip(COLOURS, MARKERS, episode.items(), strict=False):
+                path = tuple(zip(*places, strict=True))
+                if i != chosen:
+                    axes.plot(*path, color=colour, linewidth=0.6, alpha=0.5)
+                    continue
+                label = f"{side} hand"
+                axes.plot(*path, color=colour, linewidth=2.2, marker=marker, markevery=[0], zorder=10, label=label)
+        axes.set(xlabel="x, m", ylabel="y, m", zlabel="z, m")
+        axes.locator_params(nbins=4)
+        axes.locator_params(axis="z", nbins=2)
+        axes.set_title(f"{len(episodes)} of {name}; highlighted: {chosen}", fontsize=9)
+        axes.set_aspect("equal")
+        axes.tick_params(labelsize=7)
+    figure.axes[-1].legend(fontsize=8, frameon=False, loc="upper left")
+    return figure
+
+
+def _counts(row: Mapping[str, Any]) -> list[int]:
+    """Demonstrations of each training of a row."""
+    return [row["demonstrations"]] * len(row["training_minutes"])
+
+
+def _name(row: Mapping[str, Any], *, without: str = "") -> str:
+    """What tells a row from others of its table, but for one of its numbers."""
+    counted = row["data"] if without == "demonstrations" else f"{row['demonstrations']} of {row['data']}"
+    minutes = "" if without == "minutes" or row["minutes"] is None else f", {row['minutes']:g} min"
+    return f"{row['policy']}{minutes}, {counted}"
 
 
 def _success(table: Mapping[str, Any]) -> Figure:
@@ -33,7 +101,7 @@ def _success(table: Mapping[str, Any]) -> Figure:
     axes = figure.subplots()
     labels = []
     for place, row in enumerate(rows):
-        labels.append(f"{row['policy']}, {row['demonstrations']} of {row['data']}")
+        labels.append(_name(row))
         for number, name in enumerate(names):
             y = place + (number - (len(names) - 1) / 2) * 0.8 / len(names)
             _mark(axes, row["cells"][name], y, number, name if place == 0 else None)
@@ -54,28 +122,39 @@ def _mark(axes: Axes, runs: Sequence[Mapping[str, Any]], y: float, number: int, 
         axes.plot([run["pc_success"]], [at], marker, color=colour, markersize=4.0, label=label if i == 0 else None)
 
 
-def _over_demonstrations(table: Mapping[str, Any]) -> Figure:
-    """A panel for each evaluation, a curve for each policy: the mean over trainings, and a mark for each training."""
+def _curves(
+    table: Mapping[str, Any], key: str, label: str, places: Callable[[Mapping[str, Any]], Sequence[float]]
+) -> Figure:
+    """A panel for each evaluation, a curve for each policy: the mean over trainings, and a mark for each training.
+
+    Args:
+        key: the number by which the rows of a curve differ.
+        label: of the axis.
+        places: where on it the trainings of a row are.
+    """
     from matplotlib.figure import Figure
 
     names = list(table["evaluations"])
-    policies = list(dict.fromkeys((row["policy"], row["data"]) for row in table["rows"]))
-    figure = Figure(figsize=(1.0 + 3.2 * len(names), 3.2), layout="constrained")
+    curves: dict[str, list[Mapping[str, Any]]] = {}
+    for row in sorted(table["rows"], key=lambda row: row[key] or 0.0):
+        curves.setdefault(_name(row, without=key), []).append(row)
+    order = dict.fromkeys(_name(row, without=key) for row in table["rows"])
+    legend = 0.5 + 0.07 * max(map(len, order))  # inches beside the panels, at 8 points a letter
+    figure = Figure(figsize=(0.6 + 3.2 * len(names) + legend, 3.2), layout="constrained")
     panels = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
     for panel, name in zip(panels, names, strict=True):
-        for number, (policy, data) in enumerate(policies):
-            rows = [row for row in table["rows"] if (row["policy"], row["data"]) == (policy, data)]
-            rows.sort(key=lambda row: row["demonstrations"])
-            counts = [row["demonstrations"] for row in rows]
-            rates = [[run["pc_success"] for run in row["cells"][name]] for row in rows]
+        for number, curve in enumerate(order):
+            at = [places(row) for row in curves[curve]]
+            rates = [[run["pc_success"] for run in row["cells"][name]] for row in curves[curve]]
             colour, marker = COLOURS[number % len(COLOURS)], MARKERS[number % len(MARKERS)]
             means = [sum(each) / len(each) for each in rates]
-            panel.plot(counts, means, color=colour, marker=marker, markersize=4.5, label=f"{policy}, {data}")
-            for count, each in zip(counts, rates, strict=True):
-                panel.plot([count] * len(each), each, marker, color=colour, markersize=2.5, alpha=0.6)
-        panel.set(xscale="log", xlabel="demonstrations", title=name, ylim=(-2, 102))
-        panel.set_xticks(sorted({row["demonstrations"] for row in table["rows"]}))
-        panel.get_xaxis().set_major_formatter("{x:.0f}")
+            centres = [sum(each) / len(each) for each in at]
+            panel.plot(centres, means, color=colour, marker=marker, markersize=4.5, label=curve)
+            for place, each in zip(at, rates, strict=True):
+                panel.plot(place, each, marker, color=colour, markersize=2.5, alpha=0.6)
+        panel.set(xscale="log", xlabel=label, title=name, ylim=(-2, 102))
+        panel.set_xticks(sorted({row[key] for row in table["rows"] if row[key]}))
+        panel.get_xaxis().set_major_formatter("{x:g}")
         panel.minorticks_off()
         panel.grid(alpha=0.3)
     panels[0].set_ylabel("success, %")

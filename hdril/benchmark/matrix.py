@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 
-from hdril.benchmark.steps import Evaluate, Record, Train
+from hdril.benchmark.steps import Evaluate, Play, Record, Step, Train
 from hdril.demonstrations.record import PATIENCE
 from hdril.files import MAX_SEED
 from hdril.tasks import base_name, get_task
@@ -44,12 +45,17 @@ class DataSpec:
 class PolicySpec:
     """A policy, and how it is trained."""
 
-    steps: int
+    steps: int = 0
     """Steps of training."""
+    minutes: list[float] = field(default_factory=list)
+    """Instead of steps: budgets of training on one core, the start of the command included; each is a row of its own. How many
+    steps fit into them is measured first."""
     config: Path = Path("configs/train/table_lift.yaml")
     """Config file of lerobot-train."""
     options: list[str] = field(default_factory=list)
     """Further options of lerobot-train."""
+    in_memory: bool = False
+    """Hold the frames in memory (python -m lerobot_policy_hdril.in_memory): for policies that learn from windows of frames."""
 
 
 @dataclass
@@ -65,7 +71,8 @@ class EvaluationSpec:
     options: list[str] = field(default_factory=list)
     """Further options of hdril-eval, such as --policy.rollout=open_loop."""
     tuning: bool = False
-    """Whether choices are made by the results: such seeds are refused where results are reported."""
+    """Whether choices are made by the results. Other evaluations must have other seeds, and only a matrix that is for tuning
+    has a table of these."""
 
 
 @dataclass
@@ -88,6 +95,11 @@ class TableSpec:
     """The policy that the others are compared with, on the same demonstrations and seeds."""
     errors: list[str] = field(default_factory=list)
     """Errors against the expert that are shown beside success: position_error_cm, angle_error_rad, dtw_cm."""
+    trajectories: int = 0
+    """How many of the demonstrations are drawn, the first ones, with one of them highlighted."""
+    episode: int = -1
+    """A seed of the evaluations that is drawn: the first training of ``against``, or else of the first policy, with the most
+    minutes and demonstrations, on the first data. None unless given."""
     published: dict[str, str] = field(default_factory=dict)
     """Numbers of others beside ours, as text, by policy."""
     published_by: str = "published"
@@ -110,6 +122,8 @@ class Matrix:
     """Evaluations by name."""
     tables: list[TableSpec]
     """What is reported."""
+    tuning: bool = False
+    """Whether choices are made by the results. The report then says so, and every evaluation must be for tuning."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +133,8 @@ class Row:
     data: str
     policy: str
     demonstrations: int
+    minutes: float | None
+    """Budget of training; None where the steps are given."""
     evaluations: Mapping[str, tuple[Evaluate, ...]]
     """By name; one for each training seed."""
 
@@ -134,15 +150,17 @@ def rows(matrix: Matrix, table: TableSpec) -> Iterator[Row]:
         record = Record(spec.task, spec.episodes, spec.seed, spec.perturb)
         for count in table.demonstrations or [spec.episodes]:
             for policy in table.policies:
-                made = matrix.policies[policy]
-                trained = [
-                    Train(policy, record, count, made.config, tuple(made.options), made.steps, seed)
-                    for seed in table.training_seeds
-                ]
-                evaluations = {
-                    key: tuple(_evaluate(matrix, key, train) for train in trained) for key in table.evaluations
-                }
-                yield Row(name, policy, count, evaluations)
+                for minutes in matrix.policies[policy].minutes or [0.0]:
+                    trained = [_train(matrix, policy, record, count, minutes, seed) for seed in table.training_seeds]
+                    evaluations = {
+                        key: tuple(_evaluate(matrix, key, train) for train in trained) for key in table.evaluations
+                    }
+                    yield Row(name, policy, count, minutes or None, evaluations)
+
+
+def _train(matrix: Matrix, name: str, data: Record, episodes: int, minutes: float, seed: int) -> Train:
+    spec = matrix.policies[name]
+    return Train(name, data, episodes, spec.config, tuple(spec.options), spec.steps, seed, minutes, spec.in_memory)
 
 
 def _evaluate(matrix: Matrix, name: str, policy: Train) -> Evaluate:
@@ -155,6 +173,21 @@ def steps(matrix: Matrix) -> list[Evaluate]:
     found = {step: None for table in matrix.tables for row in rows(matrix, table) for entry in row.evaluations.values()
              for step in entry}  # fmt: skip
     return list(found)
+
+
+def drawn(matrix: Matrix, table: TableSpec) -> dict[str, Play]:
+    """The episodes that are drawn, by evaluation."""
+    if table.episode < 0:
+        return {}
+    policy = table.against or table.policies[0]
+    candidates = [row for row in rows(matrix, table) if (row.data, row.policy) == (table.data[0], policy)]
+    row = max(candidates, key=lambda row: (row.minutes or 0.0, row.demonstrations))
+    return {name: Play(evaluated[0], table.episode) for name, evaluated in row.evaluations.items()}
+
+
+def all_steps(matrix: Matrix) -> list[Step]:
+    """All that the report of a matrix is made of: the evaluations, and the episodes that are drawn."""
+    return [*steps(matrix), *(step for table in matrix.tables for step in drawn(matrix, table).values())]
 
 
 def check(matrix: Matrix) -> None:
@@ -175,12 +208,9 @@ def check(matrix: Matrix) -> None:
     for name, policy in matrix.policies.items():
         if not policy.config.exists():
             raise FileNotFoundError(f"policy {name}: there is no config file {policy.config}")
-        if policy.steps < 1:
-            raise ValueError(f"policy {name}: steps must be at least 1, got {policy.steps}")
+        _check_budget(name, policy)
         _check_options(f"policy {name}", policy.options, _OF_TRAINING)
-        Train(
-            name, Record("table_lift", 1), 1, policy.config, tuple(policy.options), 1, 0
-        ).settings()  # what it needs is there
+        _train(matrix, name, Record("table_lift", 1), 1, 0.0, 0).settings()  # what it needs is there
     for name, evaluation in matrix.evaluations.items():
         get_task(evaluation.task)
         _check_seeds(f"evaluation {name}", evaluation.seed, evaluation.episodes)
@@ -188,6 +218,15 @@ def check(matrix: Matrix) -> None:
     for table in matrix.tables:
         _check_table(matrix, table)
     check_held_out(matrix)
+
+
+def _check_budget(name: str, policy: PolicySpec) -> None:
+    if policy.steps < 0 or bool(policy.steps) == bool(policy.minutes):
+        raise ValueError(
+            f"policy {name}: give steps, at least 1, or else minutes; got {policy.steps} steps and {policy.minutes} minutes"
+        )
+    if wrong := [minutes for minutes in policy.minutes if not 0.0 < minutes < inf or policy.minutes.count(minutes) > 1]:
+        raise ValueError(f"policy {name}: minutes must be above 0 and differ, got {wrong[0]:g}")
 
 
 def _check_options(what: str, options: list[str], known: tuple[str, ...]) -> None:
@@ -223,10 +262,17 @@ def _check_table(matrix: Matrix, table: TableSpec) -> None:
     _check_once(table, "demonstrations", table.demonstrations)
     if not table.training_seeds:
         raise ValueError(f"table {table.title!r} names no training_seeds")
+    for name in table.evaluations if table.episode >= 0 else []:
+        if table.episode not in (seeds := _seeds(matrix.evaluations[name])):
+            raise ValueError(
+                f"table {table.title!r}: episode must be a seed of {name}, {seeds.start} to {seeds[-1]}, got {table.episode}"
+            )
     for name in table.data:
         most = matrix.data[name].episodes
         if wrong := [count for count in table.demonstrations if not 1 <= count <= most]:
             raise ValueError(f"table {table.title!r}: data {name} has 1 to {most} demonstrations, got {wrong[0]}")
+        if not 0 <= table.trajectories <= most:
+            raise ValueError(f"table {table.title!r}: trajectories must be from 0 to {most}, got {table.trajectories}")
         task = base_name(matrix.data[name].task)
         if other := [key for key in table.evaluations if base_name(matrix.evaluations[key].task) != task]:
             raise ValueError(f"table {table.title!r}: evaluation {other[0]} is not of {task}, the task of data {name}")
@@ -260,8 +306,15 @@ def check_held_out(matrix: Matrix) -> None:
                     f"evaluation {name} is not held out: {use} has its seeds {common.start} to {common[-1]} of {task}, too"
                 )
     for table in matrix.tables:
-        if tuned := [name for name in table.evaluations if matrix.evaluations[name].tuning]:
-            raise ValueError(f"table {table.title!r}: {tuned[0]} is for tuning, and is not reported")
+        for name in table.evaluations:
+            if matrix.evaluations[name].tuning and not matrix.tuning:
+                raise ValueError(
+                    f"table {table.title!r}: {name} is for tuning, and so must be the matrix (tuning: true)"
+                )
+            if matrix.tuning and not matrix.evaluations[name].tuning:
+                raise ValueError(
+                    f"table {table.title!r}: the matrix is for tuning, and so must be {name} (tuning: true)"
+                )
 
 
 def _seeds(spec: DataSpec | EvaluationSpec) -> range:

@@ -91,16 +91,16 @@ def _check_unchanged(assignment: Assignment) -> None:
 
 def _run(command: list[str], log: Path) -> int:
     """Run a command, its output into the log, until it ends or the process that started this one is gone."""
-    program = Path(sys.executable).parent / command[0]
     # The matrices are small: a second thread slows training down, and another step has the other processor.
     variables = os.environ | {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "HDRIL_DEBUG": "1"}
+    # The programs of this environment, for what the command starts by name as well.
+    variables["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", os.defpath)])
     with log.open("ab") as file:
         file.write(f"$ {shlex.join(command)}\n".encode())
         file.flush()
         process = subprocess.Popen(
-            [str(program) if program.exists() else command[0], *command[1:]],
-            stdin=subprocess.DEVNULL, stdout=file, stderr=file, env=variables, start_new_session=True,
-        )  # fmt: skip
+            command, stdin=subprocess.DEVNULL, stdout=file, stderr=file, env=variables, start_new_session=True
+        )
     Thread(target=_end_with_parent, args=(process,), daemon=True).start()
     return process.wait()
 

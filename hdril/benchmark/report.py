@@ -12,6 +12,11 @@ from hdril.evaluation.statistics import TrainingSpread
 from hdril.markdown import table as markdown_table
 
 _LISTED = re.compile(r"'?--dataset\.episodes=(\[[\d, ]+\])'?")
+_HELD_OUT = "No seed of an evaluation was trained or tuned on."
+_TUNING = (
+    "**This is for tuning.** No seed of an evaluation was trained on, but choices are made by these numbers: the best of them "
+    "are better here than they will be on other seeds."
+)
 SIGNIFICANCE = 0.05
 """Family-wise error of the tests of a table."""
 
@@ -23,7 +28,7 @@ def markdown(results: Mapping[str, Any], pictures: Sequence[Sequence[str]] = ())
         f"Made by `hdril-benchmark` of hdril {results['hdril_version']}, one thread a step, on {'; '.join(results['machines'])}. "
         "Success is in percent, with the 95 % interval (Wilson) over the seeds "
         "for one trained policy. Several trainings are written as trainings × seeds: the mean, then the range and the standard "
-        "deviation over trainings. No seed of an evaluation was trained or tuned on. Commands stand at the end.",
+        f"deviation over trainings. {_TUNING if results['tuning'] else _HELD_OUT} Commands stand at the end.",
     ]
     shown = pictures or [()] * len(results["tables"])
     for table, names in zip(results["tables"], shown, strict=True):
@@ -45,7 +50,15 @@ def _seeds(table: Mapping[str, Any]) -> str:
 
 def _rows(table: Mapping[str, Any]) -> str:
     names, errors, published = table["evaluations"], table["errors"], table["published"]
-    heads = ["policy", "trained on", "demonstrations", "minutes of training"]
+    given = any(row["minutes"] for row in table["rows"])
+    heads = [
+        "policy",
+        "trained on",
+        "demonstrations",
+        *(["minutes given"] if given else []),
+        "steps",
+        "minutes of training",
+    ]
     heads += [head for name in names for head in (name, *(f"{name}: {ERRORS[error]}" for error in errors))]
     heads += [table["published_by"]] if published else []
     lines = []
@@ -58,8 +71,15 @@ def _rows(table: Mapping[str, Any]) -> str:
             for cell in (_cell(row["cells"][name]), *(_error(row["cells"][name], error) for error in errors))
         ]
         cells += [published.get(row["policy"], "")] if published else []
-        lines.append([f"`{row['policy']}`", row["data"], row["demonstrations"], spent, *cells])
+        budget = [_minutes(row["minutes"])] if given else []
+        lines.append(
+            [f"`{row['policy']}`", row["data"], row["demonstrations"], *budget, f"{row['steps']:,}", spent, *cells]
+        )
     return markdown_table(heads, lines)
+
+
+def _minutes(given: float | None) -> str:
+    return "" if given is None else f"{given:g}"
 
 
 def _cell(runs: Sequence[Mapping[str, Any]]) -> str:
@@ -88,12 +108,22 @@ def _tests(table: Mapping[str, Any]) -> list[str]:
         adjusted = test["p_values_holm"]
         lines.append(
             [
-                f"`{test['policy']}`", test["data"], test["demonstrations"], test["evaluation"],
+                f"`{test['policy']}`", test["data"], test["demonstrations"], *_both_minutes(table, test), test["evaluation"],
                 f"{test['pc_difference']:+.1f} ({low:+.1f} to {high:+.1f})",
                 ", ".join("< 0.001" if p < 0.001 else f"{p:.2g}" for p in adjusted),
                 "yes" if max(adjusted) < SIGNIFICANCE else "not shown",
             ]
         )  # fmt: skip
+    heads = [
+        "policy",
+        "trained on",
+        "demonstrations",
+        *_both_minutes(table, None),
+        "evaluation",
+        "difference",
+        "p",
+        "differs",
+    ]
     count = sum(len(test["p_values"]) for test in table["tests"])
     several = len(table["training_seeds"]) > 1
     interval = "two-level bootstrap over trainings and seeds" if several else "Newcombe, over seeds"
@@ -106,8 +136,15 @@ def _tests(table: Mapping[str, Any]) -> list[str]:
         f"Against `{table['against']}`, seed by seed: the difference in points with its 95 % interval ({interval}), p of "
         f"McNemar's exact test for each pair of trainings, adjusted by Holm's method for the {count} tests of the table, and "
         f"whether all are below {SIGNIFICANCE}. {caution}",
-        markdown_table(["policy", "trained on", "demonstrations", "evaluation", "difference", "p", "differs"], lines),
+        markdown_table(heads, lines),
     ]
+
+
+def _both_minutes(table: Mapping[str, Any], test: Mapping[str, Any] | None) -> list[str]:
+    """Cells of the minutes given to both policies, or their headings; none in a table where no minutes are given."""
+    if not any(row["minutes"] for row in table["rows"]):
+        return []
+    return [_minutes(test["minutes"]), _minutes(test["against_minutes"])] if test else ["minutes given", "to the other"]
 
 
 def _commands(results: Mapping[str, Any]) -> list[str]:

@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 
 from hdril import __version__
 from hdril.benchmark.engine import in_order
-from hdril.benchmark.matrix import EvaluationSpec, Matrix, Row, TableSpec, rows, steps
+from hdril.benchmark.episode import EPISODE, places
+from hdril.benchmark.matrix import EvaluationSpec, Matrix, Row, TableSpec, all_steps, drawn, rows
 from hdril.benchmark.steps import Evaluate
 from hdril.benchmark.store import Store
+from hdril.demonstrations.read import read_episode
+from hdril.evaluation.checkpoint import read_json
 from hdril.evaluation.statistics import (
     bootstrap_difference,
     holm,
@@ -36,14 +39,17 @@ def collect(matrix: Matrix, store: Store) -> dict[str, Any]:
     """
     return {
         "name": matrix.name,
+        "tuning": matrix.tuning,
         "hdril_version": __version__,
-        "machines": sorted({store.get(step).machine for step in in_order(steps(matrix))}),
+        "machines": sorted({store.get(step).machine for step in in_order(all_steps(matrix))}),
         "tables": [_table(matrix, table, store) for table in matrix.tables],
     }
 
 
 def _table(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
-    found = [_row(row, store) for row in rows(matrix, table)]
+    wanted = list(rows(matrix, table))
+    found = [_row(row, store) for row in wanted]
+    recorded = {row.data: row.trainings[0].data for row in wanted}
     return {
         "title": table.title,
         "note": table.note,
@@ -55,16 +61,26 @@ def _table(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
         "published": table.published,
         "published_by": table.published_by,
         "tests": _tests(matrix, table, found),
+        "trajectories": {
+            name: [places(read_episode(store.get(step).output, number).state) for number in range(table.trajectories)]
+            for name, step in recorded.items()
+        },
+        "episodes": {
+            name: read_json(store.get(step).output / EPISODE) | {"title": step.evaluation.policy.title}
+            for name, step in drawn(matrix, table).items()
+        },
     }
 
 
 def _row(row: Row, store: Store) -> dict[str, Any]:
     trainings = [store.get(step) for step in row.trainings]
+    steps = row.trainings[0].count_steps(store.input_folders(row.trainings[0]))
     return {
         "data": row.data,
         "policy": row.policy,
         "demonstrations": row.demonstrations,
-        "steps": row.trainings[0].steps,
+        "minutes": row.minutes,
+        "steps": steps,
         "training_minutes": [round(done.seconds / 60.0, 1) for done in trainings],
         "training_commands": [store.relative(done.command) for done in trainings],
         "cells": {name: [_run(step, store) for step in steps] for name, steps in row.evaluations.items()},
@@ -99,18 +115,26 @@ def _tests(matrix: Matrix, table: TableSpec, found: Sequence[Mapping[str, Any]])
     for row, name in product(found, table.evaluations):
         if row["policy"] == table.against:
             continue
-        (base,) = (
-            other for other in found
-            if other["policy"] == table.against
-            and (other["data"], other["demonstrations"]) == (row["data"], row["demonstrations"])
-        )  # fmt: skip
+        base = _base(table, found, row)
         first, second = (_outcomes(entry["cells"][name], matrix.evaluations[name]) for entry in (row, base))
-        named = {key: row[key] for key in ("data", "demonstrations", "policy")}
+        named = {key: row[key] for key in ("data", "demonstrations", "policy", "minutes")}
+        named |= {"against_minutes": base["minutes"]}
         tests.append(named | {"evaluation": name} | _compare(first, second))
     adjusted = iter(holm([p for test in tests for p in test["p_values"]]))
     for test in tests:
         test["p_values_holm"] = [next(adjusted) for _ in test["p_values"]]
     return tests
+
+
+def _base(table: TableSpec, found: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The row that a row is compared with: of the same minutes, or else of the most, as where one of the two has steps."""
+    where = (row["data"], row["demonstrations"])
+    bases = [
+        other for other in found
+        if other["policy"] == table.against and (other["data"], other["demonstrations"]) == where
+    ]  # fmt: skip
+    same = [other for other in bases if other["minutes"] == row["minutes"]]
+    return max(same or bases, key=lambda other: other["minutes"] or 0.0)
 
 
 def _compare(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> dict[str, Any]:

@@ -1,16 +1,19 @@
-"""The steps of a benchmark: demonstrations, a training, an evaluation. Each is a command and all that decides its result."""
+"""The steps of a benchmark: demonstrations, the speed of a training, a training, an evaluation. Each is a command and all that
+decides its result."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from hdril.benchmark.calibrate import SPEED, Speed
+from hdril.benchmark.episode import EPISODE
 from hdril.demonstrations.provenance import read_provenance
 from hdril.digest import digest_file, digest_files, digest_json
 from hdril.evaluation.checkpoint import Checkpoint, read_json
@@ -29,6 +32,8 @@ from hdril.tasks import base_name
 
 Folders = Mapping[str, Path]
 """Results of a step's inputs, by the names of the inputs."""
+ENDLESS = 10**9
+"""Steps of a training that is stopped when its speed is known."""
 
 
 class Step(ABC):
@@ -99,7 +104,11 @@ class Record(Step):
 
 @dataclass(frozen=True)
 class Train(Step):
-    """Stock ``lerobot-train`` with a config file, on the first ``episodes`` demonstrations."""
+    """Stock ``lerobot-train`` with a config file, on the first ``episodes`` demonstrations.
+
+    It trains ``steps``, or as many steps as the command does in ``minutes`` on one core, its start included. LeRobot's schedules
+    depend on the number of steps, so that it is worked out before, from the speed.
+    """
 
     name: str
     """Of the policy, for people; it decides nothing."""
@@ -108,19 +117,30 @@ class Train(Step):
     config: Path
     options: tuple[str, ...]
     steps: int
+    """0 if ``minutes`` are given."""
     seed: int
     """Of weights and batches."""
+    minutes: float = 0.0
+    """0 if ``steps`` are given."""
+    in_memory: bool = False
+    """Whether the loader holds the frames in memory. It yields the same batches, sooner: it decides the speed alone."""
 
     kind = "train"
     resumes = False  # lerobot-train refuses the folder that it left
 
     @property
     def title(self) -> str:
-        return f"{self.name} on {self.episodes} of {self.data.task}, seed {self.seed}"
+        budget = f", {self.minutes:g} minutes" if self.minutes else ""
+        return f"{self.name} on {self.episodes} of {self.data.task}{budget}, seed {self.seed}"
 
     @property
     def inputs(self) -> Mapping[str, Step]:
-        return {"data": self.data}
+        speed = {"speed": Calibrate(replace(self, steps=ENDLESS, seed=0, minutes=0.0))} if self.minutes else {}
+        return {"data": self.data, **speed}
+
+    def count_steps(self, inputs: Folders) -> int:
+        """How many steps are trained, as given or by the speed among the results of the inputs."""
+        return Speed.read(inputs["speed"] / SPEED).steps(60.0 * self.minutes) if self.minutes else self.steps
 
     @property
     def policy_type(self) -> str:
@@ -147,20 +167,22 @@ class Train(Step):
             "options": list(self.options),
             "device": self._decided("device"),  # unless told, LeRobot takes what the machine has
             "episodes": self.episodes,
-            "steps": self.steps,
+            **({"minutes": self.minutes} if self.minutes else {"steps": self.steps}),
             "seed": self.seed,
             "software": software,
         }
 
     def command(self, output: Path, inputs: Folders) -> list[str]:
+        steps = self.count_steps(inputs)
         subset = [] if self.episodes == self.data.episodes else [f"--dataset.episodes={list(range(self.episodes))}"]
-        return ["lerobot-train", f"--config_path={self.config}", "--dataset.repo_id=local/benchmark",
-                f"--dataset.root={inputs['data']}", *subset, f"--output_dir={output}", f"--steps={self.steps}",
-                f"--save_freq={self.steps}", f"--seed={self.seed}", *self.options]  # fmt: skip
+        program = ["python", "-m", "lerobot_policy_hdril.in_memory"] if self.in_memory else ["lerobot-train"]
+        return [*program, f"--config_path={self.config}", "--dataset.repo_id=local/benchmark",
+                f"--dataset.root={inputs['data']}", *subset, f"--output_dir={output}", f"--steps={steps}",
+                f"--save_freq={steps}", f"--seed={self.seed}", *self.options]  # fmt: skip
 
     def checkpoint(self, output: Path) -> Path:
-        """Where the trained policy is."""
-        return output / "checkpoints" / f"{self.steps:06d}" / "pretrained_model"
+        """Where the trained policy is: the last checkpoint, and the only one."""
+        return output / "checkpoints" / "last" / "pretrained_model"
 
     def digest(self, output: Path) -> str:
         checkpoint = Checkpoint("trained", self.checkpoint(output))
@@ -184,6 +206,41 @@ def _training_software(policy_type: str) -> dict[str, str]:
 
     register_third_party_plugins()
     return software | policy_software(get_policy_class(policy_type))
+
+
+@dataclass(frozen=True)
+class Calibrate(Step):
+    """How fast a training is, on this machine and beside what else runs on it. Measured once for all budgets and seeds."""
+
+    training: Train
+    """Goes on until it is stopped."""
+    warm_up: float = 30.0
+    """s after the first step that are not taken for its speed: a policy may solve a part of itself in its first steps."""
+    measured: float = 60.0
+    """s after that of which the speed is the mean."""
+
+    kind = "calibrate"
+    resumes = False
+
+    @property
+    def title(self) -> str:
+        return f"speed of {self.training.name} on {self.training.episodes} of {self.training.data.task}"
+
+    @property
+    def inputs(self) -> Mapping[str, Step]:
+        return self.training.inputs
+
+    def settings(self) -> dict[str, Any]:
+        measured = {"in_memory": self.training.in_memory, "warm_up": self.warm_up, "measured": self.measured}
+        return self.training.settings() | measured
+
+    def command(self, output: Path, inputs: Folders) -> list[str]:
+        return ["python", "-m", "hdril.benchmark.calibrate", f"--output={output}", f"--warm_up={self.warm_up:g}",
+                f"--measured={self.measured:g}", "--", *self.training.command(output / "train", inputs),
+                "--save_checkpoint=false", "--log_freq=1"]  # fmt: skip
+
+    def digest(self, output: Path) -> str:
+        return digest_json(vars(Speed.read(output / SPEED)))
 
 
 @dataclass(frozen=True)
@@ -226,3 +283,34 @@ class Evaluate(Step):
     def digest(self, output: Path) -> str:
         read_json(output / RESULTS)  # it is whole
         return digest_file(output / RESULTS)
+
+
+@dataclass(frozen=True)
+class Play(Step):
+    """One seed of an evaluation, frame by frame, to be drawn."""
+
+    evaluation: Evaluate
+    seed: int
+
+    kind = "play"
+    resumes = False
+
+    @property
+    def title(self) -> str:
+        return f"{self.evaluation.title}, seed {self.seed}"
+
+    @property
+    def inputs(self) -> Mapping[str, Step]:
+        return self.evaluation.inputs
+
+    def settings(self) -> dict[str, Any]:
+        return self.evaluation.settings() | {"seed": self.seed}
+
+    def command(self, output: Path, inputs: Folders) -> list[str]:
+        checkpoint = self.evaluation.policy.checkpoint(inputs["policy"])
+        options = [option for option in self.evaluation.options if option.startswith(("--policy.", "--max_frames="))]
+        return ["python", "-m", "hdril.benchmark.episode", f"--policy={checkpoint}", f"--task={self.evaluation.task}",
+                f"--seed={self.seed}", f"--output={output}", *options]  # fmt: skip
+
+    def digest(self, output: Path) -> str:
+        return digest_json(read_json(output / EPISODE))

@@ -12,7 +12,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from hdril.benchmark.engine import Engine, Progress, in_order
-from hdril.benchmark.matrix import Matrix, check, steps
+from hdril.benchmark.matrix import Matrix, all_steps, check
 from hdril.benchmark.page import write_report
 from hdril.benchmark.results import collect
 from hdril.benchmark.steps import Step
@@ -60,7 +60,7 @@ def benchmark_command(config: BenchmarkConfig) -> None:
         raise ValueError("--shards and --slurm.* are for --executor=slurm; --jobs is for this machine")
     if not config.plan:
         check_execution(config.executor, config.shards, config.slurm)
-    store, wanted = Store(config.store), steps(config)
+    store, wanted = Store(config.store), all_steps(config)
     if config.plan:
         _print_plan(store, wanted)
         return
@@ -101,7 +101,7 @@ def _submit(config: BenchmarkConfig) -> None:
 
 
 def _do_steps(config: BenchmarkConfig, rank: int, world_size: int) -> None:
-    Engine(Store(config.store), config.jobs).run(steps(config))
+    Engine(Store(config.store), config.jobs).run(all_steps(config))
 
 
 def _in_words(seconds: float) -> str:

@@ -14,15 +14,19 @@ from typing import Any
 import draccus
 import numpy as np
 import pytest
+from lerobot.configs.train import TrainPipelineConfig
 
+from hdril.benchmark.calibrate import Speed
 from hdril.benchmark.engine import in_order
-from hdril.benchmark.matrix import Matrix, check, rows, steps
+from hdril.benchmark.figures import figures
+from hdril.benchmark.matrix import Matrix, all_steps, check, check_held_out, rows, steps
 from hdril.benchmark.page import write_report
 from hdril.benchmark.report import markdown
 from hdril.benchmark.results import collect
-from hdril.benchmark.steps import Evaluate, Step
+from hdril.benchmark.steps import Calibrate, Evaluate, Play, Step
 from hdril.benchmark.store import Store
 from hdril.cli.benchmark import BenchmarkConfig, benchmark_command
+from hdril.demonstrations.read import read_episode
 from hdril.digest import digest_json
 from hdril.evaluation.results import Run, summarise
 from hdril.execution import SlurmConfig
@@ -90,7 +94,7 @@ def test_commands_say_what_is_done() -> None:
         "--policy.preset=linear",
     ]  # fmt: skip
     assert evaluate.command(out, {"policy": Path("run")}) == [
-        "hdril-eval", "--policy.path=run/checkpoints/000010/pretrained_model", "--task=table_lift:level=varied",
+        "hdril-eval", "--policy.path=run/checkpoints/last/pretrained_model", "--task=table_lift:level=varied",
         f"--num_episodes={COUNT}", f"--seed={SEED}", "--rerun=none", "--workers=1", "--output_dir=out",
     ]  # fmt: skip
 
@@ -135,12 +139,19 @@ def test_a_change_of_hdril_does_not_touch_what_it_does_not_make(monkeypatch: pyt
         (lambda v: v["tables"][0].update(evaluations=[]), "names no evaluations; choose from: nominal, varied"),
         (lambda v: v["tables"][0].update(training_seeds=[]), "names no training_seeds"),
         (lambda v: v["tables"][0].update(demonstrations=[51]), "data nominal has 1 to 50 demonstrations, got 51"),
+        (lambda v: v["tables"][0].update(episode=SEED + COUNT), "episode must be a seed of nominal, 600000 to 600007"),
+        (lambda v: v["tables"][0].update(trajectories=51), "trajectories must be from 0 to 50, got 51"),
         (lambda v: v["tables"][0].update(training_seeds=[1, 1]), "training_seeds has 1 twice"),
         (lambda v: v["tables"][0].update(demonstrations=[50, 50]), "demonstrations has 50 twice"),
         (lambda v: v["tables"][0].update(policies=["hdril", "hdril"]), "policies has 'hdril' twice"),
         (lambda v: v["data"]["nominal"].update(perturb=-0.1), "data nominal: perturb must not be negative, got -0.1"),
         (lambda v: v.update(name="two words"), "name must be of letters, digits, .* got 'two words'"),
-        (lambda v: v["policies"]["act"].update(steps=0), "policy act: steps must be at least 1, got 0"),
+        (lambda v: v["policies"]["act"].update(steps=0), "policy act: give steps, at least 1, or else minutes; got 0 steps"),
+        (lambda v: v["policies"]["act"].update(steps=-1, minutes=[5]), "policy act: give steps, at least 1, or else minutes"),
+        (lambda v: v["policies"]["act"].update(minutes=[5]), r"or else minutes; got 30 steps and \[5\.0\] minutes"),
+        (lambda v: v["policies"]["act"].update(steps=0, minutes=[0]), "policy act: minutes must be above 0 and differ, got 0"),
+        (lambda v: v["policies"]["act"].update(steps=0, minutes=[5, 5]), "act: minutes must be above 0 and differ, got 5"),
+        (lambda v: v.update(tuning=True), "table 'Lift': the matrix is for tuning, and so must be nominal"),
         (lambda v: v["data"]["nominal"].update(task="juggle"), "juggle"),
         (lambda v: v["evaluations"]["nominal"].update(episodes=0), "evaluation nominal: episodes must be at least 1, got 0"),
         (lambda v: v["evaluations"]["nominal"].update(seed=2**31), "evaluation nominal: seed must be from 0 to"),
@@ -194,8 +205,9 @@ def test_seeds_that_were_trained_or_tuned_on_are_refused() -> None:
         values["evaluations"]["choice"] = tuning | {"seed": SEED + 100}
         values["tables"][0]["evaluations"] = ["choice"]
 
-    with pytest.raises(ValueError, match="choice is for tuning, and is not reported"):
+    with pytest.raises(ValueError, match="choice is for tuning, and so must be the matrix"):
         check(changed(report))
+    check(changed(lambda values: (report(values), values.update(tuning=True))))
     peg = {"task": "peg_in_hole", "episodes": 50, "seed": SEED}
     check(changed(lambda values: values["data"].update(peg=peg)))  # seeds of another task
 
@@ -205,12 +217,42 @@ def test_there_must_be_a_config_file() -> None:
         check(changed(lambda values: values["policies"]["act"].update(config="nowhere.yaml")))
 
 
-@pytest.mark.parametrize("file", sorted((ROOT / "configs/benchmark").glob("*.yaml")), ids=lambda file: file.stem)
+FILES = sorted((ROOT / "configs/benchmark").glob("*.yaml"))
+
+
+def read(file: Path) -> BenchmarkConfig:
+    return draccus.parse(BenchmarkConfig, args=[f"--config_path={file}"])
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 def test_the_benchmarks_of_this_repository_can_be(file: Path) -> None:
-    config = draccus.parse(BenchmarkConfig, args=[f"--config_path={file}"])
+    config = read(file)
     check(config)
     assert config.name == file.stem
     assert steps(config)
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_lerobot_knows_the_options_of_their_policies(file: Path) -> None:
+    for name, policy in read(file).policies.items():
+        known = draccus.parse(TrainPipelineConfig, policy.config, args=policy.options)
+        assert known.policy is not None, name
+        assert known.policy.device == "cpu", name
+
+
+def test_no_benchmark_reports_seeds_that_another_one_tunes_on() -> None:
+    matrices = [read(file) for file in FILES]
+    tuned = {
+        name: entry
+        for matrix in matrices
+        for name, entry in matrix.evaluations.items()
+        if matrix.tuning and entry.tuning
+    }
+    assert tuned
+    for matrix in matrices:
+        if not matrix.tuning:
+            theirs = {f"{name}, tuned": entry for name, entry in tuned.items()}
+            check_held_out(replace(matrix, evaluations=matrix.evaluations | theirs))
 
 
 # ---------------------------------------------------------------- what was found
@@ -218,7 +260,7 @@ def test_the_benchmarks_of_this_repository_can_be(file: Path) -> None:
 
 def pretend(store: Store, matrix: Matrix, failed: Callable[[Evaluate], set[int]]) -> None:
     """Fill a store as if all had been done: ``failed`` seeds by evaluation."""
-    for step in in_order(steps(matrix)):
+    for step in in_order(all_steps(matrix)):
         place = store.place(step)
         assert place is not None
         (place / "result").mkdir(parents=True)
@@ -231,6 +273,22 @@ def pretend(store: Store, matrix: Matrix, failed: Callable[[Evaluate], set[int]]
             run = Run(step.task, "policy", (), step.first_seed, step.episodes, True, "compared")
             results = summarise(run, outcomes) | {"identity": {"policy": {"weights": digest_json(step.policy.title)}}}
             (place / "result/results.json").write_text(json.dumps(results))
+        if isinstance(step, Play):
+            (place / "result/episode.json").write_text(json.dumps(EPISODE))
+        if isinstance(step, Calibrate):
+            (place / "result/speed.json").write_text(json.dumps(vars(SPEEDS[step.training.name])))
+
+
+EPISODE = {
+    "seed": SEED,
+    "success": False,
+    "predicted": {"left": [[0.1, 0.2, 0.3], [0.2, 0.2, 0.3]], "right": [[0.1, -0.2, 0.3], [0.2, -0.2, 0.3]]},
+    "true": {"left": [[0.1, 0.2, 0.4]], "right": [[0.1, -0.2, 0.5]]},
+}
+
+
+SPEEDS = {"act": Speed(100, 60.0, 0.25), "hdril": Speed(200, 50.0, 0.5)}
+"""ACT is ready in 35 s and does 4 steps a second, HDR-IL 2."""
 
 
 def fails(step: Evaluate) -> set[int]:
@@ -340,7 +398,7 @@ def test_the_report_says_what_was_found(tmp_path: Path) -> None:
     text = markdown(collect(matrix, store))
     assert "## Lift\n\nA note." in text
     assert (
-        "| `linear` | varied       | 50               | 1.5 to 1.5            | 2 × 8: 37.5 % (0.0 to 75.0, SD 53.0)"
+        "| `linear` | varied       | 50               | 10      | 1.5 to 1.5            | 2 × 8: 37.5 % (0.0 to 75.0, SD 53.0)"
         in text
     )
     assert "`varied`: `table_lift:level=varied`, 8 seeds from 600000 on. Training seeds: 1, 2." in text
@@ -369,6 +427,155 @@ def test_errors_and_published_numbers_stand_beside_success(tmp_path: Path) -> No
         ["0.2 (0.2 to 0.2)", ""],
         ["0.2 (0.2 to 0.2)", ""],
     ]
+
+
+def by_minutes(values: dict[str, Any]) -> None:
+    """ACT and HDR-IL for 10 and 60 minutes, the linear maps for 10 steps."""
+    one_row(values)
+    for name in SPEEDS:
+        values["policies"][name].pop("steps")
+        values["policies"][name]["minutes"] = [10, 60]
+
+
+def test_speed_is_measured_once_for_all_budgets_and_seeds_and_decides_the_steps(tmp_path: Path) -> None:
+    matrix, store = changed(by_minutes), Store(tmp_path / "store")
+    ordered = in_order(steps(matrix))
+    kinds = [step.kind for step in ordered]
+    assert {kind: kinds.count(kind) for kind in kinds} == {"record": 1, "calibrate": 2, "train": 10, "evaluate": 10}
+    act = next(step for step in steps(matrix) if step.policy.name == "act" and step.policy.minutes == 60)
+    assert store.place(act.policy) is None, "its speed is not known"
+    pretend(store, matrix, fails)
+    command = act.policy.command(Path("out"), store.input_folders(act.policy))
+    assert f"--steps={100 + (3600 - 60) * 4}" in command
+    assert f"--save_freq={100 + (3600 - 60) * 4}" in command
+    speed = act.policy.inputs["speed"]
+    told = speed.command(Path("out"), store.input_folders(speed))
+    assert told[:6] == ["python", "-m", "hdril.benchmark.calibrate", "--output=out", "--warm_up=30", "--measured=60"]
+    training = told[told.index("--") + 1 :]
+    same = {"--steps", "--save_freq", "--output_dir", "--seed", "--save_checkpoint", "--log_freq"}
+    assert [o for o in training if o.partition("=")[0] not in same] == [
+        o for o in command if o.partition("=")[0] not in same
+    ]
+
+
+def test_another_speed_is_another_training(tmp_path: Path) -> None:
+    matrix, store = changed(by_minutes), Store(tmp_path / "store")
+    pretend(store, matrix, fails)
+    trained = {step.policy: store.place(step.policy) for step in steps(matrix)}
+    speed = next(step for step in in_order(steps(matrix)) if isinstance(step, Calibrate))
+    path = store.get(speed).output.parent / "step.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"digest": "another"}))
+    again = Store(store.folder)
+    assert {step.name for step, place in trained.items() if again.place(step) != place} == {speed.training.name}
+    assert again.find(speed), "what was measured is not measured again"
+
+
+def test_frames_in_memory_decide_the_speed_alone(tmp_path: Path) -> None:
+    def held(values: dict[str, Any]) -> None:
+        by_minutes(values)
+        values["policies"]["act"]["in_memory"] = True
+
+    stock, memory = (
+        next(step.policy for step in steps(changed(change)) if step.policy.name == "act")
+        for change in (by_minutes, held)
+    )
+    assert digest_json(memory.settings()) == digest_json(stock.settings())
+    assert digest_json(memory.inputs["speed"].settings()) != digest_json(stock.inputs["speed"].settings())
+    by_steps = replace(memory, minutes=0.0, steps=7)
+    command = by_steps.command(Path("out"), {"data": Path("set")})
+    assert command[:3] == ["python", "-m", "lerobot_policy_hdril.in_memory"]
+    assert command[3:] == replace(by_steps, in_memory=False).command(Path("out"), {"data": Path("set")})[1:]
+
+
+def test_minutes_and_steps_are_reported_and_compared_like_with_like(tmp_path: Path) -> None:
+    matrix, store = changed(by_minutes), Store(tmp_path / "store")
+    pretend(store, matrix, fails)
+    results = collect(matrix, store)
+    (table,) = results["tables"]
+    told = [(row["policy"], row["minutes"], row["steps"]) for row in table["rows"]]
+    assert told == [
+        ("linear", None, 10), ("act", 10.0, 2260), ("act", 60.0, 14260), ("hdril", 10.0, 1300), ("hdril", 60.0, 7300),
+    ]  # fmt: skip
+    pairs = [(test["policy"], test["minutes"], test["against_minutes"]) for test in table["tests"]]
+    assert pairs == [("linear", None, 60.0), ("act", 10.0, 10.0), ("act", 60.0, 60.0)]
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in markdown(results).splitlines()]
+    heads = next(line for line in lines if line[0] == "policy")
+    assert heads[3:6] == ["minutes given", "steps", "minutes of training"]
+    assert next(line for line in lines if line[0] == "`act`")[2:6] == ["50", "10", "2,260", "1.5 to 1.5"]
+    assert next(line for line in lines if line[0] == "`linear`")[2:5] == ["50", "", "10"]
+    assert "success" in figures(table)
+    panel = figures(table)["minutes"].axes[0]
+    legend = panel.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "linear, 50 of varied",
+        "act, 50 of varied",
+        "hdril, 50 of varied",
+    ]
+    labels = [label.get_text() for label in figures(table)["success"].axes[0].get_yticklabels()]
+    assert labels[1:3] == ["act, 10 min, 50 of varied", "act, 60 min, 50 of varied"]
+
+
+def test_demonstrations_are_drawn_and_one_of_them_is_highlighted(dataset: Path, tmp_path: Path) -> None:
+    matrix = changed(lambda values: (one_row(values), values["tables"][0].update(trajectories=3)))
+    store = Store(tmp_path / "store")
+    pretend(store, matrix, fails)
+    output = store.get(steps(matrix)[0].policy.data).output
+    output.rmdir()
+    output.symlink_to(dataset)
+    (table,) = collect(matrix, store)["tables"]
+    ((name, episodes),) = table["trajectories"].items()
+    assert name == "varied"
+    state = read_episode(dataset, 2).state
+    np.testing.assert_allclose(episodes[2]["left"], state[:, :3], atol=6e-4)
+    np.testing.assert_allclose(episodes[2]["right"], state[:, 8:11], atol=6e-4)
+    lines = figures(table)["trajectories"].axes[0].get_lines()
+    widths = [line.get_linewidth() for line in lines]
+    assert len(lines) == 3 * 2
+    assert [i for i, width in enumerate(widths) if width == max(widths)] == [2, 3], "both hands of the second episode"
+    plain = changed(one_row)
+    assert "trajectories" not in figures(collect(plain, store)["tables"][0])
+
+
+def test_a_held_out_episode_of_the_policy_that_matters_is_drawn(tmp_path: Path) -> None:
+    def draw(values: dict[str, Any]) -> None:
+        by_minutes(values)
+        values["tables"][0].update(episode=SEED, demonstrations=[10, 50])
+        values["evaluations"]["varied"]["options"] = ["--policy.rollout=open_loop", "--max_frames=9", "--device=cpu"]
+
+    matrix, store = changed(draw), Store(tmp_path / "store")
+    (play,) = [step for step in all_steps(matrix) if isinstance(step, Play)]
+    trained = play.evaluation.policy
+    assert (trained.name, trained.minutes, trained.episodes, trained.seed) == ("hdril", 60.0, 50, 1)
+    assert play.command(Path("out"), {"policy": Path("run")}) == [
+        "python", "-m", "hdril.benchmark.episode", "--policy=run/checkpoints/last/pretrained_model",
+        "--task=table_lift:level=varied", f"--seed={SEED}", "--output=out", "--policy.rollout=open_loop", "--max_frames=9",
+    ]  # fmt: skip
+    pretend(store, matrix, fails)
+    (table,) = collect(matrix, store)["tables"]
+    left, right = figures(table)["episode"].axes
+    assert left.get_title().startswith(f"varied, seed {SEED}: failure\nhdril on 50 of")
+    drawn = {str(line.get_label()): line.get_xydata() for line in right.get_lines()}
+    np.testing.assert_allclose(drawn["y, predicted"], [[0, -0.2], [1, -0.2]])
+    np.testing.assert_allclose(drawn["the expert"], [[0, 0.1]])
+    plain = changed(lambda values: (draw(values), values["tables"][0].update(episode=-1)))
+    assert "episode" not in figures(collect(plain, store)["tables"][0])
+
+
+def test_a_report_for_tuning_says_so(tmp_path: Path) -> None:
+    def tune(values: dict[str, Any]) -> None:
+        one_row(values)
+        values["evaluations"]["varied"]["tuning"] = True
+        values["tuning"] = True
+
+    for change, words in (
+        (tune, "**This is for tuning.**"),
+        (one_row, "No seed of an evaluation was trained or tuned on."),
+    ):
+        matrix, store = changed(change), Store(tmp_path / "store")
+        if change is tune:
+            pretend(store, matrix, fails)
+        assert words in markdown(collect(matrix, store))
 
 
 def test_the_page_holds_all_that_it_shows(tmp_path: Path) -> None:

@@ -1,0 +1,66 @@
+"""One held-out episode: what a policy commands, beside where the expert's hands are.
+
+``python -m hdril.benchmark.episode --policy=CHECKPOINT --task=… --seed=… --output=FOLDER [--policy.OPTION=VALUE …]``
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hdril.evaluation.evaluate import Worker, make_job
+from hdril.files import write_atomically
+from hdril.simulation.actions import hand_poses
+from hdril.simulation.robots.spec import SIDES
+
+EPISODE = "episode.json"
+
+
+def places(rows: NDArray[np.floating]) -> dict[str, list[list[float]]]:
+    """Where each hand is in states or actions (T, 16), by side: x, y, z in m, to the millimetre, for each frame."""
+    found = hand_poses(rows)[..., :3]
+    return {side: found[:, i].round(3).tolist() for i, side in enumerate(SIDES)}
+
+
+def play(policy: str, task: str, seed: int, overrides: Sequence[str], max_frames: int | None = None) -> dict[str, Any]:
+    """An episode of a policy as plain data: the ``predicted`` places of the hands, which are its commands, and the ``true`` ones,
+    which are the noise-free expert's on the same seed; frame by frame, as long as each of the two takes.
+
+    Args:
+        policy: a checkpoint's folder.
+        overrides: changes of the policy's config, as ``--name=value``.
+        max_frames: frames after which the episode is cut; the task's budget unless given.
+    """
+    job = make_job(task, policy, seed, 1, overrides=tuple(overrides), max_frames=max_frames)
+    episode = Worker(job).play(seed)
+    # A command of a frame leads to the state after it.
+    return {
+        "seed": seed,
+        "success": episode.outcome.success,
+        "predicted": places(episode.trace.action),
+        "true": places(episode.reference.state[1:]),
+    }
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(allow_abbrev=False)
+    parser.add_argument("--policy", required=True)
+    parser.add_argument("--task", required=True)
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--max_frames", type=int)
+    told, options = parser.parse_known_args()
+    overrides = [option.replace("--policy.", "--", 1) for option in options]
+    episode = play(told.policy, told.task, told.seed, overrides, told.max_frames)
+    write_atomically(told.output / EPISODE, lambda file: file.write(json.dumps(episode).encode()))
+
+
+if __name__ == "__main__":
+    main()
