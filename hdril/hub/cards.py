@@ -39,6 +39,7 @@ def dataset_card(repo_id: str, root: Path) -> str:
     metadata = LeRobotDatasetMetadata(repo_id, root=root)
     task, recipe = get_task(provenance.recipe.task), provenance.recipe
     noise = " ".join(f"--noise.{name}={value}" for name, value in asdict(recipe.noise).items())
+    noise += f" --perturb={recipe.perturb:g}" if recipe.perturb else ""
     dropped = len(provenance.dropped)
     description = f"""Scripted demonstrations of the task `{recipe.task}` ({task.description}) with two arms of a simulated
 {recipe.robot.capitalize()}: {metadata.total_episodes} episodes, {metadata.total_frames} frames at {metadata.fps} Hz, each
@@ -76,7 +77,7 @@ Grippers go from 0 (closed) to 1 (open).
 
 {
         table(
-            ("label", "primitive", "frames an episode"),
+            ("label", "primitive", "frames, if it is not broken off"),
             [
                 (label, name, sum(primitive.frames for primitive in task.primitives if primitive.name == name))
                 for label, name in enumerate(task.labels)

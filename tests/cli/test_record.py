@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import draccus
 import pytest
 from lerobot.utils.constants import HF_LEROBOT_HOME
 
@@ -106,3 +107,13 @@ def test_a_dataset_of_another_version_is_not_published_as_made_by_this_one(
     with pytest.raises(FileExistsError, match=rf"was recorded by hdril 0\.0\.9, not by {re.escape(__version__)}"):
         record_command(RecordConfig(repo_id="user/name", num_episodes=1, seed=5, root=root, push=True))
     assert pushed == []
+
+
+@pytest.mark.parametrize("path", sorted(Path("configs/record").glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_recipe_can_be_recorded_and_names_its_own_command(path: Path) -> None:
+    config = draccus.parse(RecordConfig, config_path=path, args=[])
+    recipe = Recipe(config.task, config.noise, perturb=config.perturb)
+    assert recipe.make_env().task == config.task
+    assert path.read_text().startswith(f"# hdril-record --config_path={path.as_posix()}\n")
+    assert config.root == Path("outputs") / path.stem / "dataset"
+    assert ("level=hard" in config.task) == path.stem.endswith("_hard") == bool(config.perturb)

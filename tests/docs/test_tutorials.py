@@ -86,23 +86,24 @@ def varied(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return install(folder / "own_task", folder)
 
 
-def test_a_factor_and_an_event_are_added_word_for_word(varied: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("event", ["push", "jolt"])
+def test_a_factor_and_an_event_are_added_word_for_word(varied: Path, tmp_path: Path, event: str) -> None:
     command = [Path(sys.executable).with_name("hdril-record"), "--task=trestle_shift:mass=1.5", "--root=data",
-               "--events=push=1", "--num_episodes=3", "--workers=1"]  # fmt: skip
+               f"--events={event}=1", "--num_episodes=3", "--workers=1"]  # fmt: skip
     _run(command, tmp_path, PYTHONPATH=str(varied))
     rows = parquet.read_table(next((tmp_path / "data/meta/episodes").rglob("*.parquet"))).to_pandas()
     scenarios = [Scenario.from_json(text) for text in rows["scenario"]]
     masses = [scenario.values["mass"] for scenario in scenarios]
     assert len(set(masses)) == 3
     assert all(1 / 1.5 <= mass <= 1.5 for mass in masses)
-    assert all([event.name for event in scenario.events] == ["push"] for scenario in scenarios)
+    assert all([happened.name for happened in scenario.events] == [event] for scenario in scenarios)
 
 
 def test_a_kind_of_event_from_another_package_acts(varied: Path, tmp_path: Path) -> None:
     code = (
         "from hdril.env import BimanualEnv; from hdril.tasks.events import Event; from dataclasses import replace\n"
         "env = BimanualEnv('trestle_shift'); seen = env.reset(seed=0)[0]\n"
-        "event = Event('up', 'lift_off', 1, 1, 'trestle', (2.5,))\n"
+        "event = Event('up', 'lift_off', 1, 1, 'trestle', (-1.5, 2.0, 0.0))\n"
         "seen = env.reset(seed=0, options={'scenario': replace(env.scenario, events=(event,))})[0]\n"
         "infos = [env.step(seen['agent_pos'])[4] for _ in range(2)]\n"
         "print(repr(infos[1]['events']), infos[1]['trestle_height_m'] > 0.01)"

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import subprocess
 import sys
 from contextlib import closing
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from hdril.env import BimanualEnv
 from hdril.rollout import transitions
 from hdril.simulation.robots import SIDES
 from hdril.tasks import LEVELS, TASKS, Task, get_task, task_parameters
-from hdril.tasks.events import EVENT_KINDS, Event
+from hdril.tasks.events import EVENT_KINDS, Event, EventSpec
 from hdril.tasks.expert import ScriptedExpert
 from hdril.tasks.factors import COMMON, Factor
 from hdril.tasks.primitives import Noise
@@ -47,6 +49,34 @@ def test_nominal_scenes_are_those_of_before(task: str, level: str) -> None:
         assert (scenario.values, scenario.events) == ({}, ())
         digest.update(b"".join(scenario.pose(body.name).as_vector().tobytes() for body in nominal.bodies))
     assert digest.hexdigest() == NOMINAL[task]
+
+
+# SHA-256 of the first 100 scenes, to seven digits: where it changes, seeds that were recorded are other scenes now.
+SCENES = {
+    "clear_and_lift:level=varied": "30c84c8359377855f98d0f99004e2c0bf341ee556f82f641910cabe2abfbb891",
+    "clear_and_lift:level=hard": "53192b73a7b9eaf953ff0fd7e6cdc8375c0c7b78815d9398332726521652eca2",
+    "handover:level=varied": "de305d95f9b837d65ba80919d639892c65e09ab5a6f466dfab8c03a3d02d18e0",
+    "handover:level=hard": "2df9bfd7a40fe189447674ce83a6a21b41e16ba993a84554903a852074ced83e",
+    "peg_in_hole:level=varied": "90f3cc42cfd7ae81399cf4bc255530594c807f3c8db5871d80e475054c2599c9",
+    "peg_in_hole:level=hard": "253d9e4179a885e36a60baabe6ebad462a3fc67525152cac4b393f7ace92a4a6",
+    "table_lift:level=varied": "66daa954f4bfb8af4e91718f48f0534ec46372de405fd4eef2bbf0aaad853d96",
+    "table_lift:level=hard": "bcf52f8e1aad0659ee6eff16af07ffc78ac3de1cdfd935ad8423b91dad4be229",
+}
+
+
+def _rounded(value: Any) -> Any:
+    """Numbers as text, so that the last digit may differ between processors."""
+    if isinstance(value, float):
+        return f"{round(value, 7) + 0.0:.7f}"
+    if isinstance(value, dict):
+        return {key: _rounded(each) for key, each in value.items()}
+    return [_rounded(each) for each in value] if isinstance(value, list) else value
+
+
+@pytest.mark.parametrize("name", VARYING)
+def test_varied_scenes_are_those_that_were_recorded(name: str) -> None:
+    scenes = [_rounded(json.loads(get_task(name).sample(seed).to_json())) for seed in range(100)]
+    assert hashlib.sha256(json.dumps(scenes, sort_keys=True).encode()).hexdigest() == SCENES[name]
 
 
 # ---------------------------------------------------------------------- scenarios
@@ -369,6 +399,10 @@ def test_unknown_and_impossible_settings_name_the_valid_ones(task: str) -> None:
         ("delay=99", "^delay must be from 0 to 5 frames, got 99$"),
         ("position_noise=-1", "^position_noise must be from 0 to 0.05 m, got -1$"),
         ("any_event=1.5", "^any_event must be from 0 to 1, got 1.5$"),
+        ("detailed=0.5", "^detailed must be 0 or 1, got 0.5$"),
+        ("delay=0.4", "^delay must be a whole number of frames, got 0.4$"),
+        ("delay=1,delay=2", "^delay is given twice in 'delay=1,delay=2'$"),
+        ("level=hard,delay=0,level=varied", "^level is given twice in "),
     ]:
         with pytest.raises(ValueError, match=message):
             get_task(f"{task}:{setting}")
@@ -380,6 +414,42 @@ def test_a_range_beyond_the_robots_is_refused(task: str, factor: Factor) -> None
     for span in (factor.limit * 1.01, factor.off - 0.01):
         with pytest.raises(ValueError, match=rf"^{factor.name} must be from {factor.off:g} to {factor.limit:g}"):
             get_task(f"{task}:{factor.name}={span!r}")
+
+
+@pytest.mark.parametrize(
+    ("kind", "targets", "message"),
+    [
+        ("push", ("chair",), "^task my_lift: e cannot happen to 'chair'; choose from: table$"),
+        ("push", ("platform",), "^task my_lift: e cannot happen to 'platform'; choose from: table$"),
+        ("slide", ("table",), "^task my_lift: e cannot happen to 'table'; choose from: bench, platform$"),
+        ("open_hand", ("middle",), "^task my_lift: e cannot happen to 'middle'; choose from: left, right$"),
+    ],
+)
+def test_an_event_that_cannot_happen_to_its_target_is_refused(
+    kind: str, targets: tuple[str, ...], message: str
+) -> None:
+    strength = (0.1, 0.2) if EVENT_KINDS[kind].unit else None
+    with pytest.raises(ValueError, match=message):
+        replace(
+            get_task("table_lift"), name="my_lift", events=(EventSpec("e", kind, (0, 5), targets, strength=strength),)
+        )
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"window": (9, 5)}, "^event e: window must be from 0 on and not end before it begins, got 9 to 5$"),
+        ({"window": (-1, 5)}, "^event e: window must be from 0 on"),
+        ({"frames": (0, 2)}, "^event e: frames must be from 1 on"),
+        ({"strength": None}, "^event e: a push needs a strength$"),
+        ({"kind": "freeze"}, "^event e: a freeze has no strength$"),
+        ({"kind": "flood"}, "flood"),
+    ],
+)
+def test_an_event_that_means_nothing_is_refused(values: dict[str, Any], message: str) -> None:
+    given = {"kind": "push", "window": (0, 5), "strength": (0.1, 0.2)} | values
+    with pytest.raises(ValueError, match=message):
+        EventSpec("e", **given)
 
 
 def test_names_are_unique_within_a_task() -> None:
