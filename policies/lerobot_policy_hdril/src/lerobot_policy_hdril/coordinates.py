@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from lerobot_policy_hdril.graph import pose_groups
+
+
+def unit(quaternion: Tensor) -> Tensor:
+    """Quaternions (..., 4) of unit length; zeros stay zeros. For one row, half the time of ``F.normalize``."""
+    return quaternion / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True).clamp_min(1e-12)
 
 
 def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
@@ -62,7 +66,7 @@ class RelationalCoordinates(nn.Module):
     def _frame(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """Position (..., 3) and unit quaternion (..., 4), w >= 0 so that it has one sign, of the frame."""
         pose = state[..., self.frame]
-        quaternion = F.normalize(pose[..., 3:], dim=-1)
+        quaternion = unit(pose[..., 3:])
         return pose[..., :3], torch.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
 
     def encode_state(self, state: Tensor) -> Tensor:

@@ -117,7 +117,7 @@ def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Te
     for k in range(len(maps)):
         window = _window(demonstrations, rows[demonstrations.label[rows] == k], policy.ahead, policy.ahead)
         cast(FusedMaps, maps[k]).fit(
-            policy.features(window.state, window.filtered),
+            policy.features(window.state, window.filtered)[0],
             torch.div(window.elapsed, policy.ahead, rounding_mode="floor"),
             frames,
             window.state,

@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
 
-from lerobot_policy_hdril.coordinates import conjugate, multiply, rotate
+from lerobot_policy_hdril.coordinates import conjugate, multiply, rotate, unit
 from lerobot_policy_hdril.dynamics import ridge_penalty, solve_ridge, usual_windows
 from lerobot_policy_hdril.graph import pose_groups
 
@@ -58,13 +57,15 @@ class ObjectFrames(nn.Module):
         """Poses (1 + F, B, 7) of the world and of the objects in states (B, S)."""
         world = torch.tensor((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)).to(state).expand(1, len(state), 7)
         objects = state[:, self.frames].transpose(0, 1)
-        objects = torch.cat([objects[..., :3], F.normalize(objects[..., 3:], dim=-1)], dim=-1)
+        objects = torch.cat([objects[..., :3], unit(objects[..., 3:])], dim=-1)
         return torch.cat([world, objects])
 
-    def features(self, state: Tensor) -> Tensor:
-        """States (B, S) and beside them (B, D - S) the poses of everything in every object's frame; w >= 0."""
+    def features(self, state: Tensor, origins: Tensor | None = None) -> Tensor:
+        """States (B, S) and beside them (B, D - S) the poses of everything in every object's frame; w >= 0. ``origins`` are those
+        of the states, if they are known."""
         poses = state[:, self.poses][:, self.others]  # (B, F, P - 1, 7)
-        seen = _into(poses, self.origins(state)[1:].transpose(0, 1)[:, :, None])
+        origins = self.origins(state) if origins is None else origins
+        seen = _into(poses, origins[1:].transpose(0, 1)[:, :, None])
         seen = torch.cat([seen[..., :3], torch.where(seen[..., 6:] < 0, -seen[..., 3:], seen[..., 3:])], dim=-1)
         return torch.cat([state, seen.flatten(1)], dim=-1)
 
@@ -103,12 +104,12 @@ class FusedMaps(nn.Module):
         count, hands, grid = 1 + len(frames.frames), len(frames.hands), (starts, ahead)
         self.register_buffer("weight", torch.zeros(count, *grid, 7 * hands, features + 1))
         self.register_buffer("plain", torch.zeros(*grid, len(frames.rest), features + 1))
-        self.register_buffer("covariance", torch.eye(3).expand(count, *grid, hands, 3, 3).clone())
+        self.register_buffer("precision", torch.eye(3).expand(count, *grid, hands, 3, 3).clone())
         self.register_buffer("variance", torch.ones(count, *grid, hands))
 
     weight: Tensor
     plain: Tensor
-    covariance: Tensor
+    precision: Tensor
     variance: Tensor
 
     @torch.no_grad()
@@ -137,7 +138,7 @@ class FusedMaps(nn.Module):
         """
         for buffer, value in ((self.weight, 0.0), (self.plain, 0.0), (self.variance, 1.0)):
             buffer.fill_(value)
-        self.covariance.copy_(torch.eye(3).expand_as(self.covariance))
+        self.precision.copy_(torch.eye(3).expand_as(self.precision))
         inputs = torch.cat([seen, torch.ones_like(seen[:, :1])], dim=-1).double()
         poses, rest = frames.targets(action, state).double(), action[..., frames.rest].double()
         penalty = ridge_penalty(inputs, ridge)
@@ -159,26 +160,30 @@ class FusedMaps(nn.Module):
         self.weight[:, first, step] = solution[count:].unflatten(0, (len(poses), -1)).to(self.weight)
         far = errors[:, count:].unflatten(1, (len(poses), -1, 7))  # (N, 1 + F, G, 7)
         second = torch.einsum("nfgi,nfgj->fgij", far[..., :3], far[..., :3]) / len(far)
-        self.covariance[:, first, step] = (second + _FLOOR * torch.eye(3).to(second)).to(self.covariance)
+        self.precision[:, first, step] = torch.linalg.inv(second + _FLOOR * torch.eye(3).to(second)).to(self.precision)
         self.variance[:, first, step] = (far[..., 3:].square().sum(-1).mean(0) + _FLOOR).to(self.variance)
 
-    def forward(self, seen: Tensor, start: Tensor, frames: ObjectFrames, state: Tensor) -> Tensor:
-        """Features (B, D) at starts (B,) of plans, and the states (B, S) there, to actions (B, M, A) in the world."""
+    def forward(self, seen: Tensor, start: Tensor, frames: ObjectFrames, origins: Tensor) -> Tensor:
+        """Features (B, D) at starts (B,) of plans, and the frames' origins there (1 + F, B, 7), to actions (B, M, A) in the
+        world."""
         inputs = torch.cat([seen, torch.ones_like(seen[:, :1])], dim=-1)
-        poses = torch.einsum("fbmwd,bd->fbmw", self.weight[:, start], inputs).unflatten(-1, (-1, 7))
-        origins = frames.origins(state)[:, :, None, None].expand_as(poses)  # (1 + F, B, M, G, 7)
+        # Products, because einsum takes four times as long for one row.
+        poses = (self.weight[:, start] @ inputs[:, None, :, None])[..., 0].unflatten(-1, (-1, 7))
+        origins = origins[:, :, None, None].expand_as(poses)  # (1 + F, B, M, G, 7)
         turns = origins[..., 3:]
         means = rotate(turns, poses[..., :3]) + origins[..., :3]
         axes = torch.eye(3).to(poses).expand(*turns.shape[:-1], 3, 3)
         axes = rotate(turns[..., None, :].expand(*axes.shape[:-1], 4), axes)  # the rows are a frame's axes
-        precision = torch.linalg.inv(axes.mT @ self.covariance[:, start] @ axes)
-        position = torch.linalg.solve(precision.sum(0), (precision @ means[..., None]).sum(0))[..., 0]
-        rotations = multiply(turns, F.normalize(poses[..., 3:], dim=-1))
+        precision = axes.mT @ self.precision[:, start] @ axes
+        # Of the differences from the world's mean, which are small: precisions may differ by five orders of magnitude.
+        far = (precision @ (means - means[:1])[..., None]).sum(0)
+        position = means[0] + torch.linalg.solve(precision.sum(0), far)[..., 0]
+        rotations = multiply(turns, unit(poses[..., 3:]))
         quaternion = (_towards(rotations, rotations[:1]) / self.variance[:, start][..., None]).sum(0)
-        rest = torch.einsum("bmad,bd->bma", self.plain[start], inputs)
+        rest = (self.plain[start] @ inputs[:, None, :, None])[..., 0]
         action = rest.new_empty(*rest.shape[:2], len(frames.rest) + frames.hands.numel())
         action[..., frames.rest] = rest
-        action[..., frames.hands] = torch.cat([position, F.normalize(quaternion, dim=-1)], dim=-1)
+        action[..., frames.hands] = torch.cat([position, unit(quaternion)], dim=-1)
         return action
 
 

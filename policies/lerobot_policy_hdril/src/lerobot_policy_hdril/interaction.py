@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lerobot_policy_hdril.coordinates import conjugate, multiply, rotate
+from lerobot_policy_hdril.coordinates import conjugate, multiply, rotate, unit
 from lerobot_policy_hdril.graph import group_nodes, pose_columns
 
 SLOPE = 0.2  # of LeakyReLU, as in the graph attention paper
@@ -116,7 +116,7 @@ class ObjectAttention(nn.Module):
     def _relations(self, raw: Tensor) -> Tensor:
         """r_uv (B, N, N, 7): position in decimetres, to weigh as much as a rotation, and quaternion; 0 without poses."""
         poses = raw[:, self.poses]
-        position, quaternion = poses[..., :3], F.normalize(poses[..., 3:], dim=-1)
+        position, quaternion = poses[..., :3], unit(poses[..., 3:])
         offset = 10.0 * (position[:, None] - position[:, :, None])
         inverse = conjugate(quaternion)[:, :, None].expand(*offset.shape[:-1], 4)
         offset = rotate(inverse, offset)

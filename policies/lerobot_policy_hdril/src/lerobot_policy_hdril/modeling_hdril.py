@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -15,7 +16,7 @@ from torch.nn import functional as F
 
 from lerobot_policy_hdril.card import model_card
 from lerobot_policy_hdril.configuration_hdril import HDRILConfig
-from lerobot_policy_hdril.coordinates import RelationalCoordinates
+from lerobot_policy_hdril.coordinates import RelationalCoordinates, unit
 from lerobot_policy_hdril.demonstrations import Demonstrations, History, Window
 from lerobot_policy_hdril.dynamics import PrimitiveDynamics, predict_stacked
 from lerobot_policy_hdril.explain import Attention, Explanation, attend, explain
@@ -32,6 +33,15 @@ if TYPE_CHECKING:
     from huggingface_hub import ModelCard
     from lerobot.configs.train import TrainPipelineConfig
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+
+def _rows_by_primitive(primitive: Tensor) -> Iterator[tuple[int, Tensor | slice]]:
+    """Each primitive that is in ``primitive`` (B,), and its rows. They are a slice of all if there is but one primitive: for one
+    running episode, gathering rows takes as long as a small layer."""
+    present = primitive.unique().tolist()
+    for k in present:
+        yield k, slice(None) if len(present) == 1 else (primitive == k).nonzero().squeeze(-1)
+
 
 _HUB_OPTIONS = (
     "force_download", "resume_download", "proxies", "token", "cache_dir", "local_files_only", "revision",
@@ -304,23 +314,24 @@ class HDRILPolicy(PreTrainedPolicy):
         given = self.dynamics_input(state)
         return torch.cat([given, self.dynamics_input(filtered)], dim=-1) if self.config.filter_frames > 1 else given
 
-    def features(self, state: Tensor, filtered: Tensor) -> Tensor:
-        """What the fused maps see of states (B, S) and of the mean of the last ones (B, S)."""
+    def features(self, state: Tensor, filtered: Tensor) -> tuple[Tensor, Tensor]:
+        """What the fused maps see of states (B, S) and of the mean of the last ones (B, S); and the origins (1 + F, B, 7) of
+        their frames in the states."""
         assert self.frames is not None
         given = torch.cat([state, filtered]) if self.config.filter_frames > 1 else state
-        seen = (self.frames.features(given) - self.feature_mean) / self.feature_std
-        return torch.cat(seen.split(len(state)), dim=-1)
+        origins = self.frames.origins(given)
+        seen = (self.frames.features(given, origins) - self.feature_mean) / self.feature_std
+        return torch.cat(seen.split(len(state)), dim=-1), origins[:, : len(state)]
 
     def _fused(self, state: Tensor, filtered: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
         """Normalised outputs (B, M, A + S) of the fused maps; 0 for the states, which they do not predict."""
         assert self.frames is not None
         assert self.fused is not None
-        seen, start = self.features(state, filtered), torch.div(elapsed, self.ahead, rounding_mode="floor")
+        (seen, origins), start = self.features(state, filtered), torch.div(elapsed, self.ahead, rounding_mode="floor")
         actions = len(self.config.action_names)
         output = state.new_zeros(len(state), self.ahead, len(self.loss_weights))
-        for k in primitive.unique().tolist():
-            mine = (primitive == k).nonzero().squeeze(-1)
-            action = self.fused[k](seen[mine], start[mine], self.frames, state[mine])
+        for k, mine in _rows_by_primitive(primitive):
+            action = self.fused[k](seen[mine], start[mine], self.frames, origins[:, mine])
             output[mine, :, :actions] = (action - self.output_mean[:actions]) / self.output_std[:actions]
         return output
 
@@ -348,11 +359,13 @@ class HDRILPolicy(PreTrainedPolicy):
             models = [self.model_of(k) for k in range(len(self.config.primitives))]
             return predict_stacked(models, normalised, state, context, steps, linear, primitive, samples)
         result = torch.empty(len(state), self.ahead, len(self.loss_weights), device=state.device, dtype=state.dtype)
-        divergence = state.new_zeros(len(state))
-        for k in primitive.unique().tolist():
-            mine = (primitive == k).nonzero().squeeze(-1)
-            context = state.new_zeros(len(mine), 0)
-            part, far = self.model_of(k)(normalised[mine], state[mine], context, steps[mine], linear[mine], samples)
+        divergence, context = state.new_zeros(len(state)), state.new_zeros(len(state), 0)
+        for k, mine in _rows_by_primitive(primitive):
+            part, far = self.model_of(k)(
+                normalised[mine], state[mine], context[mine], steps[mine], linear[mine], samples
+            )
+            if isinstance(mine, slice):
+                return part, far
             result, divergence = result.index_copy(0, mine, part), divergence.index_copy(0, mine, far)
         return result, divergence
 
@@ -443,7 +456,7 @@ class HDRILPolicy(PreTrainedPolicy):
         if self.relational is not None:
             plan = self.relational.decode_output(plan, state)
         if len(self._quaternions):
-            plan[..., self._quaternions] = F.normalize(plan[..., self._quaternions], dim=-1)
+            plan[..., self._quaternions] = unit(plan[..., self._quaternions])
         return plan
 
     # ------------------------------------------------------------------ what it tells of itself
