@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,8 +54,14 @@ def write_dataset(
         metadata_buffer_size=1000, data_files_size_in_mb=file_mb,
     )  # fmt: skip
     metadata.save_episode_tasks([task.description])
-    digests, frames = _write_episodes(metadata, task, episodes)
-    metadata.finalize()
+    try:
+        digests, frames = _write_episodes(metadata, task, episodes)
+        metadata.finalize()
+    except BaseException:
+        # Otherwise it writes what it holds when it is collected, and makes the folder again, which may be removed by then.
+        with suppress(Exception):
+            metadata.finalize()
+        raise
     _sort_statistics(root)
     _write_names(root, task, frames)
     provenance = replace(provenance, digest=dataset_digest(digests))

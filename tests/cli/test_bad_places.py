@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
 import resource
 import sys
@@ -137,6 +138,8 @@ def test_a_disk_that_is_full_when_the_dataset_is_written(root: Path, refuse: Ref
         assert refuse(command.main, *options(root)) == f"{root}.partial/dataset: File too large{ROOM}"
     assert kept(root) == ["0.npz", "1.npz", "2.npz", "3.npz"]
     finish(root, monkeypatch)
+    gc.collect()
+    assert not root.with_name("set.partial").exists(), "nothing of the failed attempt is written later"
 
 
 @pytest.mark.parametrize("more", [[], ["--shards=2", "--shard=0"]])
