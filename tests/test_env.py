@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from contextlib import closing
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -75,6 +76,22 @@ def test_an_episode_without_success_ends_with_its_budget(task: str) -> None:
             _, reward, terminated, truncated, info = env.step(observation["agent_pos"])
             assert (reward, terminated, truncated) == (0.0, False, frame == horizon + 2)
             assert (info["unmet"] == "the primitives are not over") == (frame < horizon)
+
+
+@tasks
+def test_an_episode_ends_when_an_object_has_fallen_off_the_bench_and_says_which(task: str) -> None:
+    scenario = get_task(task).sample(0)
+    lost = get_task(task).observed[0]
+    beside = (0.6, 3.0, *scenario.poses[lost][2:])
+    with closing(BimanualEnv(task)) as env:
+        observation, _ = env.reset(options={"scenario": replace(scenario, poses=scenario.poses | {lost: beside})})
+        info, truncated, terminated = {"unmet": ""}, False, False
+        while not truncated:
+            assert "fallen" not in info["unmet"]
+            _, _, terminated, truncated, info = env.step(observation["agent_pos"])
+        assert env.frame < 15
+        assert not terminated
+        assert info["unmet"].split(", ")[-1] == f"{lost} has fallen off the bench"
 
 
 def test_gymnasium_knows_every_task_after_import_hdril() -> None:

@@ -105,6 +105,15 @@ def test_the_nearer_hand_puts_the_canister_aside_first(place: str, side: str) ->
         assert (y > 0.0) == (side == "left")
 
 
+def test_a_success_that_comes_late_must_hold() -> None:
+    with closing(BimanualEnv(NAME)) as env:
+        steps = list(transitions(env, ScriptedExpert(TASK, Noise(0.0)), seed_of("table", "left")))
+    held = [f"success has held for {frames} of {TASK.dwell} frames" for frames in range(1, TASK.dwell)]
+    assert [step.info["unmet"] for step in steps[-TASK.dwell :]] == [*held, ""]
+    assert not steps[-TASK.dwell - 1].info["unmet"].startswith("success")
+    assert [step.terminated for step in steps[-2:]] == [False, True]
+
+
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_a_canister_that_stands_aside_is_left_alone(side: str) -> None:
     seed = seed_of("bench", side)
