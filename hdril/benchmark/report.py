@@ -34,7 +34,7 @@ def markdown(results: Mapping[str, Any], pictures: Sequence[Sequence[str]] = ())
     for table, names in zip(results["tables"], shown, strict=True):
         blocks += [f"## {table['title']}", *([table["note"]] if table["note"] else []), _seeds(table), _rows(table)]
         blocks += [f"![{table['title']}]({name})" for name in names]
-        blocks += _tests(table)
+        blocks += [*_tests(table), *_falls(table)]
     blocks += ["## Commands", *_commands(results)]
     return "\n\n".join(blocks) + "\n"
 
@@ -102,42 +102,66 @@ def _error(runs: Sequence[Mapping[str, Any]], name: str) -> str:
 def _tests(table: Mapping[str, Any]) -> list[str]:
     if not table["tests"]:
         return []
-    lines = []
-    for test in table["tests"]:
-        low, high = test["pc_difference_ci95"]
-        adjusted = test["p_values_holm"]
-        lines.append(
-            [
-                f"`{test['policy']}`", test["data"], test["demonstrations"], *_both_minutes(table, test), test["evaluation"],
-                f"{test['pc_difference']:+.1f} ({low:+.1f} to {high:+.1f})",
-                ", ".join("< 0.001" if p < 0.001 else f"{p:.2g}" for p in adjusted),
-                "yes" if max(adjusted) < SIGNIFICANCE else "not shown",
-            ]
-        )  # fmt: skip
-    heads = [
-        "policy",
-        "trained on",
-        "demonstrations",
-        *_both_minutes(table, None),
-        "evaluation",
-        "difference",
-        "p",
-        "differs",
-    ]
-    count = sum(len(test["p_values"]) for test in table["tests"])
-    several = len(table["training_seeds"]) > 1
-    interval = "two-level bootstrap over trainings and seeds" if several else "Newcombe, over seeds"
+    lines = [
+        [f"`{test['policy']}`", test["data"], test["demonstrations"], *_both_minutes(table, test), test["evaluation"],
+         *_difference(test)]
+        for test in table["tests"]
+    ]  # fmt: skip
+    heads = ["policy", "trained on", "demonstrations", *_both_minutes(table, None), "evaluation", *_DIFFERENCE]
     caution = (
         "Few trainings show little of how trainings differ: such an interval is rather too narrow."
-        if several
+        if len(table["training_seeds"]) > 1
         else "One training of each tells two trained policies apart, not two methods."
     )
+    told = f"Against `{table['against']}`, seed by seed: {_what_differs(table, table['tests'], 'pair of trainings')} {caution}"
+    return [told, markdown_table(heads, lines)]
+
+
+def _falls(table: Mapping[str, Any]) -> list[str]:
+    if not table["falls"]:
+        return []
+    lines = [
+        [f"`{fall['policy']}`", fall["data"], fall["demonstrations"], *_budget(table, fall), fall["evaluation"], fall["control"],
+         *_difference(fall)]
+        for fall in table["falls"]
+    ]  # fmt: skip
+    budget = ["minutes given"] if any(row["minutes"] for row in table["rows"]) else []
+    heads = ["policy", "trained on", "demonstrations", *budget, "evaluation", "control", *_DIFFERENCE]
+    told = (
+        "What an event does: each evaluation against its control, in which it does not happen. Both episodes of a seed are the "
+        f"same, bit for bit, until then. The columns tell {_what_differs(table, table['falls'], 'training')}"
+    )
+    return [told, markdown_table(heads, lines)]
+
+
+_DIFFERENCE = ("difference", "p", "differs")
+"""Heads of the cells of :func:`_difference`."""
+
+
+def _difference(test: Mapping[str, Any]) -> list[str]:
+    """The difference with its interval, the adjusted p-values, and whether they show one."""
+    (low, high), adjusted = test["pc_difference_ci95"], test["p_values_holm"]
     return [
-        f"Against `{table['against']}`, seed by seed: the difference in points with its 95 % interval ({interval}), p of "
-        f"McNemar's exact test for each pair of trainings, adjusted by Holm's method for the {count} tests of the table, and "
-        f"whether all are below {SIGNIFICANCE}. {caution}",
-        markdown_table(heads, lines),
+        f"{test['pc_difference']:+.1f} ({low:+.1f} to {high:+.1f})",
+        ", ".join("< 0.001" if p < 0.001 else f"{p:.2g}" for p in adjusted),
+        "yes" if max(adjusted) < SIGNIFICANCE else "not shown",
     ]
+
+
+def _what_differs(table: Mapping[str, Any], tests: Sequence[Mapping[str, Any]], each: str) -> str:
+    """What :func:`_difference` tells, in words."""
+    several = len(table["training_seeds"]) > 1
+    interval = "two-level bootstrap over trainings and seeds" if several else "Newcombe, over seeds"
+    count = sum(len(test["p_values"]) for test in tests)
+    return (
+        f"the difference in points with its 95 % interval ({interval}), p of McNemar's exact test for each {each}, adjusted by "
+        f"Holm's method for the {count} tests of the table, and whether all are below {SIGNIFICANCE}."
+    )
+
+
+def _budget(table: Mapping[str, Any], row: Mapping[str, Any]) -> list[str]:
+    """The minutes that were given to a policy; none in a table where no minutes are given."""
+    return [_minutes(row["minutes"])] if any(row["minutes"] for row in table["rows"]) else []
 
 
 def _both_minutes(table: Mapping[str, Any], test: Mapping[str, Any] | None) -> list[str]:

@@ -61,6 +61,7 @@ def _table(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
         "published": table.published,
         "published_by": table.published_by,
         "tests": _tests(matrix, table, found),
+        "falls": _falls(matrix, table, found),
         "trajectories": {
             name: [places(read_episode(store.get(step).output, number).state) for number in range(table.trajectories)]
             for name, step in recorded.items()
@@ -120,6 +121,23 @@ def _tests(matrix: Matrix, table: TableSpec, found: Sequence[Mapping[str, Any]])
         named = {key: row[key] for key in ("data", "demonstrations", "policy", "minutes")}
         named |= {"against_minutes": base["minutes"]}
         tests.append(named | {"evaluation": name} | _compare(first, second))
+    return _adjusted(tests)
+
+
+def _falls(matrix: Matrix, table: TableSpec, found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Each evaluation in which something happens against its control, on the same seeds and with the same weights."""
+    falls = []
+    for row, name in product(found, table.evaluations):
+        if not (control := matrix.evaluations[name].control):
+            continue
+        first, second = (_outcomes(row["cells"][key], matrix.evaluations[key]) for key in (name, control))
+        named = {key: row[key] for key in ("data", "demonstrations", "policy", "minutes")}
+        falls.append(named | {"evaluation": name, "control": control} | _compare(first, second))
+    return _adjusted(falls)
+
+
+def _adjusted(tests: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The tests, each with its p-values adjusted for all of them."""
     adjusted = iter(holm([p for test in tests for p in test["p_values"]]))
     for test in tests:
         test["p_values_holm"] = [next(adjusted) for _ in test["p_values"]]
@@ -138,7 +156,7 @@ def _base(table: TableSpec, found: Sequence[Mapping[str, Any]], row: Mapping[str
 
 
 def _compare(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> dict[str, Any]:
-    """The difference of two policies with its interval, and p of each pair of trainings with the same seed.
+    """The difference in success with its interval, and p of each pair of trainings with the same seed.
 
     Args:
         first: (trainings, seeds) outcomes.

@@ -11,8 +11,9 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from hdril.benchmark.check import check
 from hdril.benchmark.engine import Engine, Progress, in_order
-from hdril.benchmark.matrix import Matrix, all_steps, check
+from hdril.benchmark.matrix import Matrix, all_steps
 from hdril.benchmark.page import write_report
 from hdril.benchmark.results import collect
 from hdril.benchmark.steps import Step

@@ -17,9 +17,10 @@ import pytest
 from lerobot.configs.train import TrainPipelineConfig
 
 from hdril.benchmark.calibrate import Speed
+from hdril.benchmark.check import check, check_held_out
 from hdril.benchmark.engine import in_order
 from hdril.benchmark.figures import figures
-from hdril.benchmark.matrix import Matrix, all_steps, check, check_held_out, rows, steps
+from hdril.benchmark.matrix import Matrix, all_steps, rows, steps
 from hdril.benchmark.page import write_report
 from hdril.benchmark.report import markdown
 from hdril.benchmark.results import collect
@@ -390,6 +391,70 @@ def test_numbers_and_tests_of_a_table(tmp_path: Path) -> None:
     low, high = linear["pc_difference_ci95"]
     assert -100.0 <= low < -62.5 < high <= 0.0
     assert str(tmp_path) not in json.dumps(table), "no path of this machine"
+
+
+def with_a_control(values: dict[str, Any]) -> None:
+    one_row(values)
+    frames = "--max_frames=210"
+    values["evaluations"] |= {
+        "calm": {"task": "table_lift:detailed=1", "episodes": COUNT, "seed": SEED, "options": [frames]},
+        "push": {"task": "table_lift:push=1", "episodes": COUNT, "seed": SEED, "control": "calm"},
+    }
+    values["tables"][0].update(evaluations=["calm", "push"], against="")
+
+
+def test_what_an_event_does_is_told_against_its_control(tmp_path: Path) -> None:
+    matrix, store = changed(with_a_control), Store(tmp_path / "store")
+    check(matrix)
+    pretend(store, matrix, lambda step: fails(step) if step.name == "push" else {SEED})
+    results = collect(matrix, store)
+    falls = {fall["policy"]: fall for fall in results["tables"][0]["falls"]}
+    assert {(fall["evaluation"], fall["control"]) for fall in falls.values()} == {("push", "calm")}
+    assert falls["linear"]["pc_difference"] == pytest.approx(-50.0)
+    assert falls["linear"]["p_values"] == pytest.approx([2 * 0.5**7, 1.0])
+    assert falls["act"]["p_values_holm"] == [1.0, 1.0]
+    assert falls["hdril"]["pc_difference"] == pytest.approx(12.5)
+    text = markdown(results)
+    assert "same, bit for bit, until then. The columns tell the difference in points" in text
+    assert "adjusted by Holm's method for the 6 tests of the table" in text
+    (line,) = (line for line in text.splitlines() if line.startswith("| `linear`") and " calm " in line)
+    assert [cell.strip() for cell in line.strip("|").split("|")][3:6] == ["push", "calm", "-50.0 (-100.0 to +0.0)"]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda e: e["push"].update(control="quiet"),
+            "^evaluation push: control has no 'quiet'; choose from: nominal, ",
+        ),
+        (lambda e: e["calm"].update(seed=SEED + 1), "^evaluation push: its control calm is not of the same scenes$"),
+        (
+            lambda e: e["push"].update(task="table_lift:push=1,yaw=5"),
+            "^evaluation push: its control calm is not of the same",
+        ),
+        (
+            lambda e: e["push"].update(task="table_lift:detailed=1"),
+            "^evaluation push: something must happen in it, and nothing",
+        ),
+        (
+            lambda e: e["calm"].update(task="table_lift:push=0.5"),
+            "^evaluation push: something must happen in it, and nothing",
+        ),
+        (
+            lambda e: e["calm"].update(options=[]),
+            "^evaluation push is cut after 210 frames, its control calm after 70: give",
+        ),
+    ],
+)
+def test_a_control_is_of_the_same_scenes_and_as_long(change: Callable[[dict[str, Any]], object], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        check(changed(lambda values: (with_a_control(values), change(values["evaluations"]))))
+
+
+def test_a_table_with_an_event_has_its_control() -> None:
+    with pytest.raises(ValueError, match=r"^table 'Lift': push needs its control calm among the evaluations$"):
+        check(changed(lambda values: (with_a_control(values), values["tables"][0].update(evaluations=["push"]))))
 
 
 def test_the_report_says_what_was_found(tmp_path: Path) -> None:
