@@ -130,7 +130,7 @@ def test_a_canister_that_stands_aside_is_left_alone(side: str) -> None:
 @pytest.mark.parametrize(("place", "side"), PLACES)
 def test_a_planner_that_skips_the_step_fails(place: str, side: str, level: str) -> None:
     """The canister stays on the table, or the table shoves it over the platform, or behind it, or off the bench."""
-    for seed in seeds_of(place, side, level)[: 4 if level == "nominal" else 2]:
+    for seed in seeds_of(place, side, level)[: 3 if level == "nominal" else 1]:
         info, begun, env = play(seed, TABLE_LIFT, level, max_episode_steps=TASK.horizon + 30)
         with closing(env):
             assert set(begun) <= set(TABLE_LIFT)
