@@ -199,7 +199,7 @@ def digest_of_episode(env: BimanualEnv, seed: int, frames: int) -> str:
     return digest.hexdigest()
 
 
-@pytest.mark.parametrize(("number", "task"), enumerate(TASKS))
+@pytest.mark.parametrize(("number", "task"), list(enumerate(TASKS)))
 def test_same_seed_same_episode_bit_for_bit_in_another_process(number: int, task: str) -> None:
     """Past an event, of another kind in each task."""
     kinds = sorted({spec.kind for spec in TASKS[task].events})
