@@ -74,6 +74,8 @@ def read_arrays(path: Path) -> dict[str, Any]:
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             return dict(arrays)
+    except MemoryError:
+        raise
     except Exception as error:  # a damaged file makes zipfile and NumPy raise a dozen kinds, SyntaxError among them
         raise ValueError(f"{path} is damaged: {error or type(error).__name__}") from error
 

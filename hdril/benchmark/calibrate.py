@@ -92,12 +92,14 @@ def main() -> None:
     parser.add_argument("--measured", type=float, required=True)
     parser.add_argument("command", nargs="+")
     told = parser.parse_args()
+    if told.output.exists():
+        parser.error(f"{told.output} exists")
     try:
         speed = measure(told.command, told.warm_up, told.measured)
     except ValueError as error:
         sys.exit(str(error))
     finally:
-        shutil.rmtree(told.output, ignore_errors=True)  # what the training wrote
+        shutil.rmtree(told.output, ignore_errors=True)  # what the training wrote in there
     write_atomically(told.output / SPEED, lambda file: file.write(json.dumps(vars(speed)).encode()))
 
 

@@ -91,6 +91,15 @@ def _check_control(matrix: Matrix, name: str, evaluation: EvaluationSpec) -> Non
     )
     if first != second:
         raise ValueError(f"evaluation {name}: its control {evaluation.control} is not of the same scenes")
+    ours, theirs = (
+        [option for option in spec.options if not option.startswith(_FRAMES)] for spec in (evaluation, control)
+    )
+    if ours != theirs:
+        raise ValueError(f"evaluation {name}: its control {evaluation.control} has other options")
+    if get_task(evaluation.task).state_names != get_task(control.task).state_names:
+        raise ValueError(
+            f"evaluation {name}: its control {evaluation.control} observes other numbers: set detailed=1 in it"
+        )
     happens = [
         bool(task.variation.rates or task.variation.any_event)
         for task in map(get_task, (evaluation.task, control.task))
@@ -105,10 +114,15 @@ def _check_control(matrix: Matrix, name: str, evaluation: EvaluationSpec) -> Non
         )
 
 
+_FRAMES = "--max_frames="
+
+
 def _frames(evaluation: EvaluationSpec) -> int:
     """Frames after which its episodes are cut."""
-    given = [option.partition("=")[2] for option in evaluation.options if option.startswith("--max_frames=")]
-    return int(given[-1]) if given else get_task(evaluation.task).budget
+    given = [option.removeprefix(_FRAMES) for option in evaluation.options if option.startswith(_FRAMES)]
+    if given and not given[-1].isdecimal():
+        raise ValueError(f"{_FRAMES.rstrip('=')} must be a whole number of frames, got {given[-1]!r}")
+    return get_task(evaluation.task).episode_limit(int(given[-1]) if given else None, _FRAMES.rstrip("="))
 
 
 def _check_table(matrix: Matrix, table: TableSpec) -> None:
@@ -166,10 +180,8 @@ def check_held_out(matrix: Matrix) -> None:
         *((f"tuning on {name}", base_name(e.task), _seeds(e)) for name, e in matrix.evaluations.items() if e.tuning),
     ]
     for name, evaluation in matrix.evaluations.items():
-        if evaluation.tuning:
-            continue
         seeds, task = _seeds(evaluation), base_name(evaluation.task)
-        for use, other, theirs in used:
+        for use, other, theirs in used[: len(matrix.data)] if evaluation.tuning else used:
             common = range(max(seeds.start, theirs.start), min(seeds.stop, theirs.stop))
             if other == task and common:
                 raise ValueError(

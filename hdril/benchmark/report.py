@@ -18,7 +18,7 @@ _TUNING = (
     "are better here than they will be on other seeds."
 )
 SIGNIFICANCE = 0.05
-"""Family-wise error of the tests of a table."""
+"""Family-wise error of a list of tests."""
 
 
 def markdown(results: Mapping[str, Any], pictures: Sequence[Sequence[str]] = ()) -> str:
@@ -155,7 +155,7 @@ def _what_differs(table: Mapping[str, Any], tests: Sequence[Mapping[str, Any]], 
     count = sum(len(test["p_values"]) for test in tests)
     return (
         f"the difference in points with its 95 % interval ({interval}), p of McNemar's exact test for each {each}, adjusted by "
-        f"Holm's method for the {count} tests of the table, and whether all are below {SIGNIFICANCE}."
+        f"Holm's method for these {count} tests, and whether all are below {SIGNIFICANCE}."
     )
 
 

@@ -167,7 +167,8 @@ class Train(Step):
             "options": list(self.options),
             "device": self._decided("device"),  # unless told, LeRobot takes what the machine has
             "episodes": self.episodes,
-            **({"minutes": self.minutes} if self.minutes else {"steps": self.steps}),
+            **({"minutes": self.minutes, "calibration": _calibration()} if self.minutes else {"steps": self.steps}),
+            **({"in_memory": _in_memory_software()} if self.in_memory else {}),
             "seed": self.seed,
             "software": software,
         }
@@ -189,6 +190,20 @@ class Train(Step):
         # The same weights may act otherwise by another config. Not train_config.json, which holds the folder of the output.
         config = {key: value for key, value in checkpoint.read_config().items() if key not in ELSEWHERE}
         return digest_json([digest_files([checkpoint.weights, *checkpoint.processors]), config])
+
+
+def _calibration() -> str:
+    """What makes steps of minutes."""
+    return source_software("benchmark/calibrate.py")["hdril"]
+
+
+def _in_memory_software() -> dict[str, str]:
+    """What makes batches of frames in memory."""
+    package = find_spec("lerobot_policy_hdril")
+    assert package is not None
+    assert package.origin is not None
+    versions = {name: distribution_version(name) for name in ("datasets", "pyarrow")}
+    return {"source": digest_file(Path(package.origin).with_name("in_memory.py"))} | versions
 
 
 def _training_software(policy_type: str) -> dict[str, str]:
@@ -231,7 +246,7 @@ class Calibrate(Step):
         return self.training.inputs
 
     def settings(self) -> dict[str, Any]:
-        measured = {"in_memory": self.training.in_memory, "warm_up": self.warm_up, "measured": self.measured}
+        measured = {"calibration": _calibration(), "warm_up": self.warm_up, "measured": self.measured}
         return self.training.settings() | measured
 
     def command(self, output: Path, inputs: Folders) -> list[str]:
@@ -304,7 +319,8 @@ class Play(Step):
         return self.evaluation.inputs
 
     def settings(self) -> dict[str, Any]:
-        return self.evaluation.settings() | {"seed": self.seed}
+        drawn = {"seed": self.seed, "episode": source_software("benchmark/episode.py")["hdril"]}
+        return self.evaluation.settings() | drawn
 
     def command(self, output: Path, inputs: Folders) -> list[str]:
         checkpoint = self.evaluation.policy.checkpoint(inputs["policy"])

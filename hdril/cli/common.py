@@ -91,7 +91,8 @@ def _words(error: BaseException) -> str:
     if isinstance(error, OSError) and error.errno is not None:
         for names, remedy in _REMEDIES.items():
             if errno.errorcode.get(error.errno) in names:
-                where = f"{error.filename}: " if error.filename else ""
+                file = error.filename2 or error.filename  # of a file that is moved, where it was to go
+                where = f"{file}: " if file else ""
                 return f"{where}{os.strerror(error.errno)}; {remedy}"
     return str(error)
 

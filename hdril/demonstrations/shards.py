@@ -44,14 +44,14 @@ class Shards:
     @property
     def empty(self) -> bool:
         """Whether there is no episode yet."""
-        return not any(map(_is_episode, self._folder.iterdir()))
+        return not any(map(_is_episode, _there(self._folder)))
 
     def remove(self) -> None:
         """Remove what the recording wrote, and the folder. Files of others stay, and are told."""
         # First the plan: a shard that is late sees by it that the recording is over.
         (self._folder / _PLAN).unlink(missing_ok=True)
         shutil.rmtree(self.staged, ignore_errors=True)
-        for path in self._folder.iterdir():
+        for path in _there(self._folder):
             if _is_episode(path) or is_scrap(path.name):
                 with suppress(OSError):  # what cannot be removed is told
                     path.unlink()
@@ -157,4 +157,5 @@ def _load(path: Path, seed: int) -> Episode:
     if len({len(value) for value in values.values() if value.ndim}) != 1:
         raise ValueError(f"{path} is damaged: its arrays differ in length")
     texts: dict[str, Any] = {name: str(values[name]) for name in ("unmet", "scenario")}
-    return Episode(**values | texts | {"seed": seed, "success": bool(values["success"])})
+    known = {field.name: values[field.name] for field in fields(Episode)}
+    return Episode(**known | texts | {"seed": seed, "success": bool(values["success"])})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import time
@@ -68,6 +69,11 @@ def test_the_command_writes_the_speed_and_nothing_else(tmp_path: Path) -> None:
     assert "step:" not in done.stdout, "but for thousands of steps"
     assert [path.name for path in output.iterdir()] == [SPEED]
     assert Speed.read(output / SPEED).warm_steps >= 2
+    again = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert again.returncode == 2
+    assert f"{output} exists" in again.stderr
+    assert (output / SPEED).exists(), "what is there is nobody's to remove"
+    shutil.rmtree(output)
     failing = subprocess.run(
         [*command[: command.index("--") + 1], sys.executable, "-c", "raise SystemExit(2)"],
         capture_output=True,

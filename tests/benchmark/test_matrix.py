@@ -202,6 +202,9 @@ def test_seeds_that_were_trained_or_tuned_on_are_refused() -> None:
     ):
         check(changed(lambda values: values["evaluations"].update(choice=tuning)))
 
+    with pytest.raises(ValueError, match=r"evaluation choice is not held out: data nominal has its seeds 0 to 9"):
+        check(changed(lambda values: values["evaluations"].update(choice=tuning | {"seed": 0})))
+
     def report(values: dict[str, Any]) -> None:
         values["evaluations"]["choice"] = tuning | {"seed": SEED + 100}
         values["tables"][0]["evaluations"] = ["choice"]
@@ -416,7 +419,7 @@ def test_what_an_event_does_is_told_against_its_control(tmp_path: Path) -> None:
     assert falls["hdril"]["pc_difference"] == pytest.approx(12.5)
     text = markdown(results)
     assert "same, bit for bit, until then. The columns tell the difference in points" in text
-    assert "adjusted by Holm's method for the 6 tests of the table" in text
+    assert "adjusted by Holm's method for these 6 tests" in text
     (line,) = (line for line in text.splitlines() if line.startswith("| `linear`") and " calm " in line)
     assert [cell.strip() for cell in line.strip("|").split("|")][3:6] == ["push", "calm", "-50.0 (-100.0 to +0.0)"]
 
@@ -445,6 +448,19 @@ def test_what_an_event_does_is_told_against_its_control(tmp_path: Path) -> None:
             lambda e: e["calm"].update(options=[]),
             "^evaluation push is cut after 210 frames, its control calm after 70: give",
         ),
+        (
+            lambda e: e["calm"].update(options=["--max_frames=many"]),
+            "^--max_frames must be a whole number of frames, got 'many'$",
+        ),
+        (lambda e: e["calm"].update(options=["--max_frames=9"]), "^--max_frames must be at least 70, got 9"),
+        (
+            lambda e: e["push"].update(options=["--policy.samples=2"]),
+            "^evaluation push: its control calm has other options$",
+        ),
+        (
+            lambda e: e["calm"].update(task="table_lift"),
+            "^evaluation push: its control calm observes other numbers: set detailed=1 in it$",
+        ),
     ],
 )
 def test_a_control_is_of_the_same_scenes_and_as_long(change: Callable[[dict[str, Any]], object], words: str) -> None:
@@ -467,7 +483,7 @@ def test_the_report_says_what_was_found(tmp_path: Path) -> None:
         in text
     )
     assert "`varied`: `table_lift:level=varied`, 8 seeds from 600000 on. Training seeds: 1, 2." in text
-    assert "adjusted by Holm's method for the 4 tests of the table" in text
+    assert "adjusted by Holm's method for these 4 tests" in text
     assert "not shown" in text
     assert "published" not in text
     assert "hdril-eval --policy.path=STORE/train/" in text
@@ -535,7 +551,7 @@ def test_another_speed_is_another_training(tmp_path: Path) -> None:
     assert again.find(speed), "what was measured is not measured again"
 
 
-def test_frames_in_memory_decide_the_speed_alone(tmp_path: Path) -> None:
+def test_frames_in_memory_are_another_training_by_what_holds_them(tmp_path: Path) -> None:
     def held(values: dict[str, Any]) -> None:
         by_minutes(values)
         values["policies"]["act"]["in_memory"] = True
@@ -544,8 +560,11 @@ def test_frames_in_memory_decide_the_speed_alone(tmp_path: Path) -> None:
         next(step.policy for step in steps(changed(change)) if step.policy.name == "act")
         for change in (by_minutes, held)
     )
-    assert digest_json(memory.settings()) == digest_json(stock.settings())
-    assert digest_json(memory.inputs["speed"].settings()) != digest_json(stock.inputs["speed"].settings())
+    held_by = memory.settings()["in_memory"]
+    assert set(held_by) == {"source", "datasets", "pyarrow"}
+    assert memory.settings() == stock.settings() | {"in_memory": held_by}
+    assert memory.inputs["speed"].settings()["in_memory"] == held_by
+    assert {"calibration", "minutes"} < set(stock.settings())
     by_steps = replace(memory, minutes=0.0, steps=7)
     command = by_steps.command(Path("out"), {"data": Path("set")})
     assert command[:3] == ["python", "-m", "lerobot_policy_hdril.in_memory"]
