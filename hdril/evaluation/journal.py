@@ -123,7 +123,7 @@ def _read_outcomes(path: Path, tell: bool) -> Iterator[Outcome]:
 
 
 def _outcome(values: dict[str, Any]) -> Outcome:
-    for name in ("start", "primitives"):
+    for name in ("start", "primitives", "expert_primitives"):
         values[name] = tuple(values[name])
     for name in ("events", "noticed"):
         values[name] = tuple((frame, words) for frame, words in values[name])

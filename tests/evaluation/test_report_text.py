@@ -39,14 +39,22 @@ def write(folder: Path) -> dict[str, Any]:
         "measures": {"gap_mm": 1.5, "insertion_mm": 80.25, "offset_mm": 0.0},
         "position_error_cm_by_primitive": {labels[0]: 0.5},
         "primitives": labels,
+        "expert_primitives": labels,
         "planner_confusion": [],
     }
     failed = {"success": False, "position_error_cm": 3.0}
     outcomes = [
         outcome(7, **shared),
         outcome(8, **shared, **failed, unmet="gap, level", stage="left half placed", departed_in=labels[2]),
-        outcome(9, **shared, **failed, unmet="gap", stage="", ik_failures=4),
-        outcome(10, **shared, **failed, unmet="gap", stage="left half placed", expert_success=False),
+        outcome(9, **shared | {"primitives": labels[1:]}, **failed, unmet="gap", stage="", ik_failures=4),
+        outcome(
+            10,
+            **shared | {"primitives": labels[:2]},
+            **failed,
+            unmet="gap",
+            stage="left half placed",
+            expert_success=False,
+        ),
     ]
     return write_report(folder, RUN, outcomes, COMPARISON)
 
