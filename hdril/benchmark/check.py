@@ -21,6 +21,7 @@ _OF_EVALUATION = (
     "push", "shards", "shard", "executor",
 )  # fmt: skip
 """What the benchmark sets by itself, so that the matrix says what was done; or what it cannot keep track of."""
+_FRAMES = "--max_frames="
 
 
 def check(matrix: Matrix) -> None:
@@ -112,9 +113,6 @@ def _check_control(matrix: Matrix, name: str, evaluation: EvaluationSpec) -> Non
         raise ValueError(
             f"evaluation {name} is cut after {ours} frames, its control {evaluation.control} after {theirs}: give --max_frames"
         )
-
-
-_FRAMES = "--max_frames="
 
 
 def _frames(evaluation: EvaluationSpec) -> int:

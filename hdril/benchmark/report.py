@@ -50,15 +50,7 @@ def _seeds(table: Mapping[str, Any]) -> str:
 
 def _rows(table: Mapping[str, Any]) -> str:
     names, errors, published = table["evaluations"], table["errors"], table["published"]
-    given = any(row["minutes"] for row in table["rows"])
-    heads = [
-        "policy",
-        "trained on",
-        "demonstrations",
-        *(["minutes given"] if given else []),
-        "steps",
-        "minutes of training",
-    ]
+    heads = ["policy", "trained on", "demonstrations", *_budget(table, None), "steps", "minutes of training"]
     heads += [head for name in names for head in (name, *(f"{name}: {ERRORS[error]}" for error in errors))]
     heads += [table["published_by"]] if published else []
     lines = []
@@ -71,10 +63,10 @@ def _rows(table: Mapping[str, Any]) -> str:
             for cell in (_cell(row["cells"][name]), *(_error(row["cells"][name], error) for error in errors))
         ]
         cells += [published.get(row["policy"], "")] if published else []
-        budget = [_minutes(row["minutes"])] if given else []
         lines.append(
-            [f"`{row['policy']}`", row["data"], row["demonstrations"], *budget, f"{row['steps']:,}", spent, *cells]
-        )
+            [f"`{row['policy']}`", row["data"], row["demonstrations"], *_budget(table, row), f"{row['steps']:,}", spent,
+             *cells]
+        )  # fmt: skip
     return markdown_table(heads, lines)
 
 
@@ -125,8 +117,7 @@ def _falls(table: Mapping[str, Any]) -> list[str]:
          *_difference(fall)]
         for fall in table["falls"]
     ]  # fmt: skip
-    budget = ["minutes given"] if any(row["minutes"] for row in table["rows"]) else []
-    heads = ["policy", "trained on", "demonstrations", *budget, "evaluation", "control", *_DIFFERENCE]
+    heads = ["policy", "trained on", "demonstrations", *_budget(table, None), "evaluation", "control", *_DIFFERENCE]
     told = (
         "What an event does: each evaluation against its control, in which it does not happen. Both episodes of a seed are the "
         f"same, bit for bit, until then. The columns tell {_what_differs(table, table['falls'], 'training')}"
@@ -159,16 +150,17 @@ def _what_differs(table: Mapping[str, Any], tests: Sequence[Mapping[str, Any]], 
     )
 
 
-def _budget(table: Mapping[str, Any], row: Mapping[str, Any]) -> list[str]:
-    """The minutes that were given to a policy; none in a table where no minutes are given."""
-    return [_minutes(row["minutes"])] if any(row["minutes"] for row in table["rows"]) else []
+def _budget(table: Mapping[str, Any], row: Mapping[str, Any] | None) -> list[str]:
+    """The cell of the minutes given to a policy, or its heading; none in a table where no minutes are given."""
+    if not any(each["minutes"] for each in table["rows"]):
+        return []
+    return [_minutes(row["minutes"])] if row else ["minutes given"]
 
 
 def _both_minutes(table: Mapping[str, Any], test: Mapping[str, Any] | None) -> list[str]:
-    """Cells of the minutes given to both policies, or their headings; none in a table where no minutes are given."""
-    if not any(row["minutes"] for row in table["rows"]):
-        return []
-    return [_minutes(test["minutes"]), _minutes(test["against_minutes"])] if test else ["minutes given", "to the other"]
+    """The same for the two policies of a test."""
+    budget = _budget(table, test)
+    return [*budget, _minutes(test["against_minutes"]) if test else "to the other"] if budget else []
 
 
 def _commands(results: Mapping[str, Any]) -> list[str]:

@@ -118,9 +118,8 @@ def _tests(matrix: Matrix, table: TableSpec, found: Sequence[Mapping[str, Any]])
             continue
         base = _base(table, found, row)
         first, second = (_outcomes(entry["cells"][name], matrix.evaluations[name]) for entry in (row, base))
-        named = {key: row[key] for key in ("data", "demonstrations", "policy", "minutes")}
-        named |= {"against_minutes": base["minutes"]}
-        tests.append(named | {"evaluation": name} | _compare(first, second))
+        named = _named(row) | {"against_minutes": base["minutes"], "evaluation": name}
+        tests.append(named | _compare(first, second))
     return _adjusted(tests)
 
 
@@ -131,9 +130,13 @@ def _falls(matrix: Matrix, table: TableSpec, found: Sequence[Mapping[str, Any]])
         if not (control := matrix.evaluations[name].control):
             continue
         first, second = (_outcomes(row["cells"][key], matrix.evaluations[key]) for key in (name, control))
-        named = {key: row[key] for key in ("data", "demonstrations", "policy", "minutes")}
-        falls.append(named | {"evaluation": name, "control": control} | _compare(first, second))
+        falls.append(_named(row) | {"evaluation": name, "control": control} | _compare(first, second))
     return _adjusted(falls)
+
+
+def _named(row: Mapping[str, Any]) -> dict[str, Any]:
+    """What tells a row from the others."""
+    return {key: row[key] for key in ("data", "demonstrations", "policy", "minutes")}
 
 
 def _adjusted(tests: list[dict[str, Any]]) -> list[dict[str, Any]]:

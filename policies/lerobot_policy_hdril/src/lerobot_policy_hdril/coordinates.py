@@ -9,7 +9,7 @@ from lerobot_policy_hdril.graph import pose_groups
 
 
 def unit(quaternion: Tensor) -> Tensor:
-    """Quaternions (..., 4) of unit length; zeros stay zeros. For one row, half the time of ``F.normalize``."""
+    """Quaternions (..., 4) of unit length; zeros stay zeros. For one row, two thirds of the time of ``F.normalize``."""
     return quaternion / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True).clamp_min(1e-12)
 
 

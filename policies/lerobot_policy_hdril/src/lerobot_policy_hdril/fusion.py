@@ -167,8 +167,7 @@ class FusedMaps(nn.Module):
         """Features (B, D) at starts (B,) of plans, and the frames' origins there (1 + F, B, 7), to actions (B, M, A) in the
         world."""
         inputs = torch.cat([seen, torch.ones_like(seen[:, :1])], dim=-1)
-        # Products, because einsum takes four times as long for one row.
-        poses = (self.weight[:, start] @ inputs[:, None, :, None])[..., 0].unflatten(-1, (-1, 7))
+        poses = torch.einsum("fbmwd,bd->fbmw", self.weight[:, start], inputs).unflatten(-1, (-1, 7))
         origins = origins[:, :, None, None].expand_as(poses)  # (1 + F, B, M, G, 7)
         turns = origins[..., 3:]
         means = rotate(turns, poses[..., :3]) + origins[..., :3]
@@ -180,7 +179,7 @@ class FusedMaps(nn.Module):
         position = means[0] + torch.linalg.solve(precision.sum(0), far)[..., 0]
         rotations = multiply(turns, unit(poses[..., 3:]))
         quaternion = (_towards(rotations, rotations[:1]) / self.variance[:, start][..., None]).sum(0)
-        rest = (self.plain[start] @ inputs[:, None, :, None])[..., 0]
+        rest = torch.einsum("bmad,bd->bma", self.plain[start], inputs)
         action = rest.new_empty(*rest.shape[:2], len(frames.rest) + frames.hands.numel())
         action[..., frames.rest] = rest
         action[..., frames.hands] = torch.cat([position, unit(quaternion)], dim=-1)

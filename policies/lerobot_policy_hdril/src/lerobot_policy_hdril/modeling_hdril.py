@@ -35,17 +35,17 @@ if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
 
+_HUB_OPTIONS = (
+    "force_download", "resume_download", "proxies", "token", "cache_dir", "local_files_only", "revision",
+)  # fmt: skip
+
+
 def _rows_by_primitive(primitive: Tensor) -> Iterator[tuple[int, Tensor | slice]]:
     """Each primitive that is in ``primitive`` (B,), and its rows. They are a slice of all if there is but one primitive: for one
     running episode, gathering rows takes as long as a small layer."""
     present = primitive.unique().tolist()
     for k in present:
         yield k, slice(None) if len(present) == 1 else (primitive == k).nonzero().squeeze(-1)
-
-
-_HUB_OPTIONS = (
-    "force_download", "resume_download", "proxies", "token", "cache_dir", "local_files_only", "revision",
-)  # fmt: skip
 
 
 class HDRILPolicy(PreTrainedPolicy):
