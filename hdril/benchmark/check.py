@@ -9,6 +9,7 @@ from math import inf
 from hdril.benchmark.matrix import ERRORS, DataSpec, EvaluationSpec, Matrix, PolicySpec, TableSpec, training
 from hdril.benchmark.steps import Record
 from hdril.demonstrations.record import PATIENCE
+from hdril.evaluation.identity import identify_trials
 from hdril.files import MAX_SEED
 from hdril.tasks import base_name, built_as, get_task
 
@@ -21,7 +22,7 @@ _OF_EVALUATION = (
     "push", "shards", "shard", "executor",
 )  # fmt: skip
 """What the benchmark sets by itself, so that the matrix says what was done; or what it cannot keep track of."""
-_FRAMES = "--max_frames="
+_FRAMES, _MISHAP = "--max_frames=", "--mishap="
 
 
 def check(matrix: Matrix) -> None:
@@ -49,6 +50,10 @@ def check(matrix: Matrix) -> None:
         get_task(evaluation.task)
         _check_seeds(f"evaluation {name}", evaluation.seed, evaluation.episodes)
         _check_options(f"evaluation {name}", evaluation.options, _OF_EVALUATION)
+        try:
+            _frames(evaluation)
+        except ValueError as error:
+            raise ValueError(f"evaluation {name}: {error}") from None
         if evaluation.control:
             _check_control(matrix, name, evaluation)
     for table in matrix.tables:
@@ -93,7 +98,8 @@ def _check_control(matrix: Matrix, name: str, evaluation: EvaluationSpec) -> Non
     if first != second:
         raise ValueError(f"evaluation {name}: its control {evaluation.control} is not of the same scenes")
     ours, theirs = (
-        [option for option in spec.options if not option.startswith(_FRAMES)] for spec in (evaluation, control)
+        [option for option in spec.options if not option.startswith((_FRAMES, _MISHAP))]
+        for spec in (evaluation, control)
     )
     if ours != theirs:
         raise ValueError(f"evaluation {name}: its control {evaluation.control} has other options")
@@ -101,10 +107,7 @@ def _check_control(matrix: Matrix, name: str, evaluation: EvaluationSpec) -> Non
         raise ValueError(
             f"evaluation {name}: its control {evaluation.control} observes other numbers: set detailed=1 in it"
         )
-    happens = [
-        bool(task.variation.rates or task.variation.any_event)
-        for task in map(get_task, (evaluation.task, control.task))
-    ]
+    happens = [_something_happens(spec) for spec in (evaluation, control)]
     if happens != [True, False]:
         raise ValueError(
             f"evaluation {name}: something must happen in it, and nothing in its control {evaluation.control}"
@@ -117,10 +120,22 @@ def _check_control(matrix: Matrix, name: str, evaluation: EvaluationSpec) -> Non
 
 def _frames(evaluation: EvaluationSpec) -> int:
     """Frames after which its episodes are cut."""
-    given = [option.removeprefix(_FRAMES) for option in evaluation.options if option.startswith(_FRAMES)]
-    if given and not given[-1].isdecimal():
-        raise ValueError(f"{_FRAMES.rstrip('=')} must be a whole number of frames, got {given[-1]!r}")
-    return get_task(evaluation.task).episode_limit(int(given[-1]) if given else None, _FRAMES.rstrip("="))
+    given = _given(evaluation, _FRAMES)
+    if given and not given.isdecimal():
+        raise ValueError(f"{_FRAMES.strip('-=')} must be a whole number of frames, got {given!r}")
+    frames = int(given) if given else None
+    return identify_trials(evaluation.task, 0, 1, frames, _given(evaluation, _MISHAP)).max_frames
+
+
+def _something_happens(evaluation: EvaluationSpec) -> bool:
+    """Whether something disturbs the scene, or the policy's actions."""
+    variation = get_task(evaluation.task).variation
+    return bool(variation.rates or variation.any_event or _given(evaluation, _MISHAP))
+
+
+def _given(evaluation: EvaluationSpec, option: str) -> str:
+    """What an option of an evaluation was given, the last time; empty if it was not."""
+    return next((each.removeprefix(option) for each in reversed(evaluation.options) if each.startswith(option)), "")
 
 
 def _check_table(matrix: Matrix, table: TableSpec) -> None:

@@ -19,6 +19,7 @@ from hdril.evaluation.evaluate import Job, make_job
 from hdril.evaluation.held_out import HeldOut, check_held_out
 from hdril.evaluation.journal import Journal
 from hdril.evaluation.lerobot_actor import foreign_primitives
+from hdril.evaluation.mishap import describe_mishap
 from hdril.evaluation.observation import check_observation, observes_details
 from hdril.evaluation.report import write_report
 from hdril.evaluation.results import Comparison, Run, compare, headline
@@ -60,6 +61,9 @@ class EvalConfig(PlayOptions):
     """Frames after which an episode is cut; at least the task's horizon. By default that is its budget: the frames of the
     task's longest plan, or three times as many where scenes vary or something may happen. With more, a policy that failed
     may try again."""
+    mishap: str = ""
+    """What spoils the policy's first grasp: its actions are changed during the first primitive. hands_stay, fingers_open, or
+    hands_high (by 6 cm). Does the policy notice, and grasp again?"""
     training_data: Path | None = None
     """Folder of the dataset that the policy was trained on, if it is not found: to check that the seeds are held out. It
     must have the statistics that the checkpoint keeps. Checkpoints of hdril know their training data."""
@@ -86,7 +90,7 @@ def _check(config: EvalConfig) -> None:
     get_task(config.task)
     if config.suite:
         check_suite(config.suite, config.task)
-        if alone := [name for name in ("push", "max_frames") if getattr(config, name)]:
+        if alone := [name for name in ("push", "max_frames", "mishap") if getattr(config, name)]:
             raise ValueError(
                 f"{alone[0]} is an option of one evaluation, not of a suite: give the task of a cell instead"
             )
@@ -94,6 +98,8 @@ def _check(config: EvalConfig) -> None:
         raise ValueError("cells are those of a suite: add --suite=factors")
     if config.push:
         check_repo_id("push", config.push)
+        if config.mishap:
+            raise ValueError("--push is for results that LeRobot can make again: leave out --mishap")
     check_shards(config, bool(config.push))
     if config.in_shards and config.executor != "ray" and config.output_dir is None:
         raise ValueError("shards need --output_dir: the command that goes on must find what they played")
@@ -113,7 +119,7 @@ def eval_command(config: EvalConfig, overrides: tuple[str, ...] = ()) -> None:
         raise FileExistsError(f"{output} exists; choose another output_dir or delete it")
     job = make_job(
         config.task, config.policy.path, config.seed, config.num_episodes, overrides=overrides,
-        device=config.policy.device, max_frames=config.max_frames,
+        device=config.policy.device, max_frames=config.max_frames, mishap=config.mishap,
     )  # fmt: skip
     held_out = check_held_out(job.checkpoint, config.task, job.seeds, config.training_data)
     if not held_out.known:
@@ -145,8 +151,11 @@ def eval_command(config: EvalConfig, overrides: tuple[str, ...] = ()) -> None:
 def describe(job: Job, held_out: HeldOut) -> Run:
     """What the report says of an evaluation, the results aside."""
     trials, task = job.identity.trials, get_task(job.task)
-    foreign = foreign_primitives(job.checkpoint, task)
-    note = f"Not of this task are the policy's primitives {', '.join(foreign)}: its planner is not scored."
+    notes = []
+    if foreign := foreign_primitives(job.checkpoint, task):
+        notes.append(f"Not of this task are the policy's primitives {', '.join(foreign)}: its planner is not scored.")
+    if trials.mishap:
+        notes.append(describe_mishap(trials.mishap, task))
     return Run(
         task=job.task,
         policy=job.checkpoint.name,
@@ -156,7 +165,7 @@ def describe(job: Job, held_out: HeldOut) -> Run:
         held_out=held_out.known,
         held_out_basis=held_out.basis,
         max_frames=0 if trials.max_frames == task.budget else trials.max_frames,
-        notes=(note,) if foreign else (),
+        notes=tuple(notes),
         identity=job.identity.as_dict(),
         policy_folder=str(job.checkpoint.folder),
     )

@@ -11,6 +11,7 @@ from hdril.env import BimanualEnv
 from hdril.evaluation.checkpoint import Checkpoint, find_checkpoint, identify, resolve_config
 from hdril.evaluation.identity import Identity, identify_trials
 from hdril.evaluation.lerobot_actor import LeRobotActor, foreign_primitives
+from hdril.evaluation.mishap import MishapActor
 from hdril.evaluation.reference import Reference, ReferenceCache
 from hdril.evaluation.score import Outcome, score_episode
 from hdril.trace import Trace, trace_episode
@@ -58,6 +59,7 @@ def make_job(
     overrides: tuple[str, ...] = (),
     device: str = "cpu",
     max_frames: int | None = None,
+    mishap: str = "",
 ) -> Job:
     """Find and check all that an evaluation needs; nothing is written.
 
@@ -68,13 +70,14 @@ def make_job(
         overrides: changes of the policy's config, as ``--name=value``.
         device: of the policy.
         max_frames: frames after which an episode is cut; the task's budget unless given.
+        mishap: name of what changes the policy's first actions; nothing unless given.
 
     Raises:
         FileNotFoundError: there is no such checkpoint.
         ValueError: something is invalid or damaged; says what, and the valid choices.
     """
     checkpoint = find_checkpoint(policy) if isinstance(policy, str) else policy
-    trials = identify_trials(task, first_seed, num_episodes, max_frames)
+    trials = identify_trials(task, first_seed, num_episodes, max_frames, mishap)
     identity = Identity(identify(checkpoint, resolve_config(checkpoint, overrides, device)), trials)
     return Job(task, checkpoint, identity, overrides)
 
@@ -94,9 +97,11 @@ class Worker:
         identity = self.job.identity
         self.env = BimanualEnv(self.job.task, max_episode_steps=identity.trials.max_frames)
         self._references = ReferenceCache(self.job.task)
-        self._actor = LeRobotActor(
+        actor = LeRobotActor(
             self.job.checkpoint, self.env.task_spec, self.job.overrides, identity.policy.device, identity.policy
         )
+        mishap = identity.trials.mishap
+        self._actor = MishapActor(actor, mishap, self.env.task_spec) if mishap else actor
         self._foreign = foreign_primitives(self.job.checkpoint, self.env.task_spec)
 
     def play(self, seed: int) -> EvaluatedEpisode:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from hdril.digest import SHORT
+from hdril.evaluation.mishap import MISHAPS
 from hdril.evaluation.software import evaluation_software
 from hdril.tasks import DETAILED, base_name, get_task, task_parameters
+from hdril.tasks.task import Variation
 
 Values = Mapping[str, Any]
 
@@ -51,6 +53,8 @@ class TrialsIdentity:
     max_frames: int
     """Frames after which an episode is cut."""
     software: dict[str, str]
+    mishap: str = ""
+    """What changes the policy's first actions, see :data:`hdril.evaluation.mishap.MISHAPS`; empty: nothing."""
 
 
 @dataclass(frozen=True)
@@ -65,13 +69,20 @@ class Identity:
         return asdict(self)
 
 
-def identify_trials(task: str, first_seed: int, num_episodes: int, max_frames: int | None = None) -> TrialsIdentity:
-    """The trials on a task's seeds from ``first_seed`` on; ``max_frames`` is the task's budget unless given.
+def identify_trials(
+    task: str, first_seed: int, num_episodes: int, max_frames: int | None = None, mishap: str = ""
+) -> TrialsIdentity:
+    """The trials on a task's seeds from ``first_seed`` on; ``max_frames`` is the task's budget unless given. After a mishap
+    that is as many frames as where something may happen: a grasp can be tried again.
 
     Raises:
-        ValueError: there is no such task, or an episode would be cut before the task's horizon, where success is judged.
+        ValueError: there is no such task or mishap, or an episode would be cut before the task's horizon, where success is
+            judged.
     """
-    horizon, budget = get_task(task).horizon, get_task(task).budget
+    if mishap and mishap not in MISHAPS:
+        raise ValueError(f"mishap must be {', '.join(MISHAPS)}, got {mishap!r}")
+    spec = get_task(task)
+    horizon, budget = spec.horizon, replace(spec, variation=Variation(any_event=1.0)).budget if mishap else spec.budget
     frames = budget if max_frames is None else max_frames
     if frames < horizon:
         raise ValueError(
@@ -79,7 +90,7 @@ def identify_trials(task: str, first_seed: int, num_episodes: int, max_frames: i
         )
     software = evaluation_software(base_name(task))
     parameters = {name: value for name, value in task_parameters(task).items() if name != DETAILED}
-    return TrialsIdentity(base_name(task), parameters, first_seed, num_episodes, frames, software)
+    return TrialsIdentity(base_name(task), parameters, first_seed, num_episodes, frames, software, mishap)
 
 
 def _leaves(values: Values, path: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:

@@ -16,7 +16,7 @@ from hdril.simulation.robots import ROBOTS
 _EPISODE = ("actor.py", "env.py", "geometry.py", "rollout.py", "simulation", "tasks", "trace.py")
 _SCORES = (
     *_EPISODE, "evaluation/evaluate.py", "evaluation/lerobot_actor.py", "evaluation/metrics.py",
-    "evaluation/motion.py", "evaluation/reference.py", "evaluation/score.py",
+    "evaluation/mishap.py", "evaluation/motion.py", "evaluation/reference.py", "evaluation/score.py",
 )  # fmt: skip
 
 

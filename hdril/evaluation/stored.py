@@ -65,6 +65,7 @@ class StoredEvaluation:
         job = make_job(
             self.results["task"], checkpoint, trials["first_seed"], trials["num_episodes"],
             overrides=tuple(self.results["overrides"]), device=policy["device"], max_frames=trials["max_frames"],
+            mishap=trials.get("mishap", ""),
         )  # fmt: skip
         require_same(
             str(self.folder), _without_software(policy), _without_software(asdict(job.identity.policy)),

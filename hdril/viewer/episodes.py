@@ -56,7 +56,8 @@ def compare(first: StoredEvaluation, second: StoredEvaluation, seed: int, path: 
     jobs = [evaluation.job() for evaluation in (first, second)]
     # Both are played with the software of now, on this seed: what is left to differ is the task and the budget.
     one, other = (
-        {name: getattr(job.identity.trials, name) for name in ("task", "parameters", "max_frames")} for job in jobs
+        {name: getattr(job.identity.trials, name) for name in ("task", "parameters", "max_frames", "mishap")}
+        for job in jobs
     )
     require_same(str(second.folder), other, one, f"compare evaluations of what {first.folder} is of")
     with ExitStack() as worlds:

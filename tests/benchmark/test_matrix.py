@@ -450,9 +450,12 @@ def test_what_an_event_does_is_told_against_its_control(tmp_path: Path) -> None:
         ),
         (
             lambda e: e["calm"].update(options=["--max_frames=many"]),
-            "^--max_frames must be a whole number of frames, got 'many'$",
+            "^evaluation calm: max_frames must be a whole number of frames, got 'many'$",
         ),
-        (lambda e: e["calm"].update(options=["--max_frames=9"]), "^--max_frames must be at least 70, got 9"),
+        (
+            lambda e: e["calm"].update(options=["--max_frames=9"]),
+            "^evaluation calm: max_frames must be at least 70, .*; got 9",
+        ),
         (
             lambda e: e["push"].update(options=["--policy.samples=2"]),
             "^evaluation push: its control calm has other options$",
