@@ -69,21 +69,6 @@ def paired_counts(first: Mapping[int, bool], second: Mapping[int, bool]) -> Pair
     return PairedCounts(*(pairs.count(pair) for pair in ((True, True), (True, False), (False, True), (False, False))))
 
 
-def most_discordant(first: int, second: int, trials: int) -> PairedCounts:
-    """The pairs that give the largest p-value of :func:`mcnemar_exact`, where only the successes of each policy are known.
-
-    The difference of the two discordant counts is given by the successes, and p rises with their sum. If one policy
-    succeeded on all seeds or on none, these are the only pairs possible, and p is exact.
-
-    Raises:
-        ValueError: more successes than trials, a negative number, or no trials.
-    """
-    if not 0 <= first <= trials or not 0 <= second <= trials:
-        raise ValueError(f"successes must be from 0 to {trials}, got {first} and {second}")
-    both = max(0, first + second - trials)
-    return PairedCounts(both, first - both, second - both, trials - first - second + both)
-
-
 def mcnemar_exact(counts: PairedCounts) -> float:
     """p-value of McNemar's exact two-sided test of equal success rates; 1 if no seed tells the policies apart.
 

@@ -13,7 +13,6 @@ from hdril.evaluation.statistics import (
     TrainingSpread,
     holm,
     mcnemar_exact,
-    most_discordant,
     paired_counts,
     paired_difference_interval,
     wilson_interval,
@@ -86,21 +85,6 @@ def test_mcnemar_is_twice_the_binomial_tail_of_the_discordant_pairs(b: int, c: i
 @pytest.mark.parametrize("counts", [PairedCounts(10, 0, 0, 3), PairedCounts(4, 5, 5, 1)])
 def test_policies_that_no_pair_tells_apart_have_p_one(counts: PairedCounts) -> None:
     assert mcnemar_exact(counts) == 1.0
-
-
-def test_margins_alone_bound_the_p_value() -> None:
-    for first in range(9):
-        for second in range(9):
-            worst = most_discordant(first, second, 8)
-            assert (worst.both + worst.first_only, worst.both + worst.second_only, worst.trials) == (first, second, 8)
-            possible = [
-                mcnemar_exact(PairedCounts(both, first - both, second - both, 8 - first - second + both))
-                for both in range(max(0, first + second - 8), min(first, second) + 1)
-            ]
-            assert mcnemar_exact(worst) == pytest.approx(max(possible))
-    for first, second in ((9, 2), (2, 9), (-1, 2), (2, -1)):
-        with pytest.raises(ValueError, match=f"from 0 to 8, got {first} and {second}"):
-            most_discordant(first, second, 8)
 
 
 def test_difference_interval_is_newcombes() -> None:
