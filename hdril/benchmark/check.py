@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from math import inf
 
 from hdril.benchmark.matrix import ERRORS, DataSpec, EvaluationSpec, Matrix, PolicySpec, TableSpec, training
+from hdril.benchmark.page import slug
 from hdril.benchmark.steps import Record
 from hdril.demonstrations.record import PATIENCE
 from hdril.evaluation.identity import identify_trials
@@ -58,6 +59,11 @@ def check(matrix: Matrix) -> None:
             _check_control(matrix, name, evaluation)
     for table in matrix.tables:
         _check_table(matrix, table)
+    titles = [slug(table.title) for table in matrix.tables]
+    if alike := [table.title for table in matrix.tables if titles.count(slug(table.title)) > 1]:
+        raise ValueError(
+            f"tables need titles that differ in letters or digits; alike are {' and '.join(map(repr, alike))}"
+        )
     check_held_out(matrix)
 
 

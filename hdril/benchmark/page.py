@@ -26,7 +26,7 @@ _STYLE = (
 
 
 def write_report(document: Path, results: Mapping[str, Any]) -> list[Path]:
-    """Write ``<document>.json``, ``.md`` and ``.html``, and each figure as ``<document>_<number>_<name>.png`` and ``.svg``.
+    """Write ``<document>.json``, ``.md`` and ``.html``, and each figure as ``<document>_<table>_<name>.png`` and ``.svg``.
 
     The page holds everything that it shows. Returns the files.
     """
@@ -37,8 +37,8 @@ def write_report(document: Path, results: Mapping[str, Any]) -> list[Path]:
     drawn = [figures(table) for table in results["tables"]]
     files: dict[Path, bytes] = {beside(".json"): json.dumps(results, indent=1).encode()}
     names = []
-    for number, found in enumerate(drawn, 1):
-        names.append([f"{document.name}_{number}_{name}" for name in found])
+    for table, found in zip(results["tables"], drawn, strict=True):
+        names.append([f"{document.name}_{slug(table['title'])}_{name}" for name in found])
         for name, figure in zip(names[-1], found.values(), strict=True):
             for kind in ("png", "svg"):
                 files[document.with_name(f"{name}.{kind}")] = _picture(figure, kind)
@@ -48,6 +48,11 @@ def write_report(document: Path, results: Mapping[str, Any]) -> list[Path]:
     for path, data in files.items():
         write_atomically(path, lambda file, data=data: file.write(data))
     return list(files)
+
+
+def slug(title: str) -> str:
+    """A title as a part of file names."""
+    return re.sub(r"\W+", "_", title.lower()).strip("_")
 
 
 def _picture(figure: Figure, kind: str) -> bytes:

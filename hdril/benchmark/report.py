@@ -25,14 +25,19 @@ def markdown(results: Mapping[str, Any], pictures: Sequence[Sequence[str]] = ())
     """The report, with links to the pictures of each table, if there are any."""
     blocks = [
         f"# Benchmark: {results['name']}",
-        f"Made by `hdril-benchmark` of hdril {results['hdril_version']}, one thread a step, on {'; '.join(results['machines'])}. "
-        "Success is in percent, with the 95 % interval (Wilson) over the seeds "
+        "Made by `hdril-benchmark`, one thread a step. Success is in percent, with the 95 % interval (Wilson) over the seeds "
         "for one trained policy. Several trainings are written as trainings × seeds: the mean, then the range and the standard "
         f"deviation over trainings. {_TUNING if results['tuning'] else _HELD_OUT} Commands stand at the end.",
     ]
     shown = pictures or [()] * len(results["tables"])
     for table, names in zip(results["tables"], shown, strict=True):
-        blocks += [f"## {table['title']}", *([table["note"]] if table["note"] else []), _seeds(table), _rows(table)]
+        blocks += [
+            f"## {table['title']}",
+            *([table["note"]] if table["note"] else []),
+            _seeds(table),
+            _made(table["made"]),
+            _rows(table),
+        ]
         blocks += [f"![{table['title']}]({name})" for name in names]
         blocks += [*_tests(table), *_falls(table)]
     blocks += ["## Commands", *_commands(results)]
@@ -46,6 +51,12 @@ def _seeds(table: Mapping[str, Any]) -> str:
         for name, spec in table["evaluations"].items()
     ]
     return f"Evaluations: {'; '.join(told)}. Training seeds: {', '.join(map(str, table['training_seeds']))}."
+
+
+def _made(made: Mapping[str, Any]) -> str:
+    """What made a table, in a sentence."""
+    software = ", ".join(f"{name} {version}" for name, version in made["software"].items())
+    return f"Made in {made['hours']:.1f} hours of work on {'; '.join(made['machines'])}, with {software}."
 
 
 def _rows(table: Mapping[str, Any]) -> str:

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hdril import __version__
 from hdril.benchmark.engine import in_order
 from hdril.benchmark.episode import EPISODE, places
 from hdril.benchmark.matrix import EvaluationSpec, Matrix, Row, TableSpec, all_steps, drawn, rows
 from hdril.benchmark.steps import Evaluate
 from hdril.benchmark.store import Store
 from hdril.demonstrations.read import read_episode
+from hdril.digest import SHORT, digest_file, digest_json
 from hdril.evaluation.checkpoint import read_json
 from hdril.evaluation.statistics import (
     bootstrap_difference,
@@ -40,9 +41,48 @@ def collect(matrix: Matrix, store: Store) -> dict[str, Any]:
     return {
         "name": matrix.name,
         "tuning": matrix.tuning,
-        "hdril_version": __version__,
-        "machines": sorted({store.get(step).machine for step in in_order(all_steps(matrix))}),
-        "tables": [_table(matrix, table, store) for table in matrix.tables],
+        "tables": [_table(matrix, table, store) | {"made": _made(matrix, table, store)} for table in matrix.tables],
+    }
+
+
+def keep_tables(matrix: Matrix, results: dict[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
+    """Results of some tables, with those that an earlier report has of the others: whose definition has not changed since.
+
+    The tables are in the order of the matrix.
+    """
+    found = {table["title"]: table for table in results["tables"]}
+    if (before.get("name"), before.get("tuning")) == (matrix.name, matrix.tuning):
+        asked = {table.title: _asked(matrix, table) for table in matrix.tables}
+        kept = {
+            table["title"]: table for table in before["tables"] if asked.get(table["title"]) == table["made"]["asked"]
+        }
+        found = kept | found
+    return results | {"tables": [found[table.title] for table in matrix.tables if table.title in found]}
+
+
+def _asked(matrix: Matrix, table: TableSpec) -> str:
+    """Digest of the definition of a table: what it names, and how that is defined."""
+    policies = [
+        asdict(spec) | {"config": digest_file(spec.config)}
+        for spec in (matrix.policies[name] for name in table.policies)
+    ]
+    data, evaluations = (
+        [asdict(known[name]) for name in names]
+        for names, known in ((table.data, matrix.data), (table.evaluations, matrix.evaluations))
+    )
+    return digest_json([asdict(table), data, policies, evaluations])[:SHORT]
+
+
+def _made(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
+    """What made a table: the versions, the machines, and how many hours of one core or more the steps took."""
+    steps = all_steps(replace(matrix, tables=[table]))
+    done = [store.get(step) for step in in_order(steps)]
+    software = [step.settings()["software"] for step in steps if isinstance(step, Evaluate)]
+    return {
+        "asked": _asked(matrix, table),
+        "software": {name: version for versions in software for name, version in versions.items()},
+        "machines": sorted({each.machine for each in done}),
+        "hours": round(sum(each.seconds for each in done) / 3600.0, 2),
     }
 
 

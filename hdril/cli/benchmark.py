@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 
@@ -15,11 +15,12 @@ from hdril.benchmark.check import check
 from hdril.benchmark.engine import Engine, Progress, in_order
 from hdril.benchmark.matrix import Matrix, all_steps
 from hdril.benchmark.page import write_report
-from hdril.benchmark.results import collect
+from hdril.benchmark.results import collect, keep_tables
 from hdril.benchmark.steps import Step
 from hdril.benchmark.store import Store
 from hdril.cli.common import run
 from hdril.cli.shards import log_folder
+from hdril.evaluation.checkpoint import read_json
 from hdril.execution import SlurmConfig, check_execution, submit_to_slurm
 
 
@@ -35,6 +36,9 @@ class BenchmarkConfig(Matrix):
     """Folder of all results."""
     document: Path | None = None
     """Where the report goes, without suffix: .html, .md, .json and figures. Default: outputs/benchmark/<name>/<name>."""
+    only: list[str] = field(default_factory=list)
+    """Titles of tables to do, ["Table lift"]; all unless given. The others stay in the report as it has them, if their definition
+    has not changed."""
     jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Steps at a time; each has one thread."""
     plan: bool = False
@@ -47,10 +51,20 @@ class BenchmarkConfig(Matrix):
     slurm: SlurmConfig = field(default_factory=SlurmConfig)
     """What these jobs may take."""
 
+    @property
+    def chosen(self) -> Matrix:
+        """The matrix with the tables that are to be done."""
+        values = {item.name: getattr(self, item.name) for item in fields(Matrix)}
+        tables = [table for table in self.tables if table.title in self.only or not self.only]
+        return replace(Matrix(**values), tables=tables)
+
 
 def benchmark_command(config: BenchmarkConfig) -> None:
     """Do what is left, and report."""
     check(config)
+    if unknown := [title for title in config.only if title not in {table.title for table in config.tables}]:
+        titles = ", ".join(repr(table.title) for table in config.tables)
+        raise ValueError(f"only has no table {unknown[0]!r}; choose from: {titles}")
     if not re.fullmatch(r"[\w.-]+", _document(config).name):
         raise ValueError(f"document must end with letters, digits, '.', '_' and '-', got {_document(config).name!r}")
     if config.jobs < 1:
@@ -61,7 +75,7 @@ def benchmark_command(config: BenchmarkConfig) -> None:
         raise ValueError("--shards and --slurm.* are for --executor=slurm; --jobs is for this machine")
     if not config.plan:
         check_execution(config.executor, config.shards, config.slurm)
-    store, wanted = Store(config.store), all_steps(config)
+    store, wanted = Store(config.store), all_steps(config.chosen)
     if config.plan:
         _print_plan(store, wanted)
         return
@@ -78,7 +92,10 @@ def benchmark_command(config: BenchmarkConfig) -> None:
             bar.update()
 
         Engine(store, config.jobs, watch).run(wanted)
-    results, document = collect(config, store), _document(config)
+    results, document = collect(config.chosen, store), _document(config)
+    before = document.with_name(document.name + ".json")
+    if config.only and before.exists():
+        results = keep_tables(config, results, read_json(before))
     write_report(document, results)
     print(f"Report: {document}.html, and as Markdown beside it")
 
@@ -102,7 +119,7 @@ def _submit(config: BenchmarkConfig) -> None:
 
 
 def _do_steps(config: BenchmarkConfig, rank: int, world_size: int) -> None:
-    Engine(Store(config.store), config.jobs).run(all_steps(config))
+    Engine(Store(config.store), config.jobs).run(all_steps(config.chosen))
 
 
 def _in_words(seconds: float) -> str:

@@ -671,11 +671,11 @@ def test_the_page_holds_all_that_it_shows(tmp_path: Path) -> None:
     results = collect(matrix, store)
     files = write_report(tmp_path / "out/test", results)
     names = {path.name for path in files}
-    pictures = {f"test_1_{name}.{kind}" for name in ("success", "demonstrations") for kind in ("png", "svg")}
+    pictures = {f"test_lift_{name}.{kind}" for name in ("success", "demonstrations") for kind in ("png", "svg")}
     assert names == {"test.json", "test.md", "test.html"} | pictures
     assert names == {path.name for path in (tmp_path / "out").iterdir()}
     page, text = ((tmp_path / f"out/test.{kind}").read_text() for kind in ("html", "md"))
-    assert "![Lift](test_1_success.png)" in text
+    assert "![Lift](test_lift_success.png)" in text
     assert page.count("<svg") == 2
     assert "<img" not in page
     assert "<table>" in page
@@ -711,6 +711,47 @@ def test_the_command_plans_and_reports_without_doing_what_is_done(
     ):
         with pytest.raises(ValueError, match=words):
             benchmark_command(replace(config, **options))
+
+
+def test_tables_are_done_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A report grows over several commands, on machines that need not share a store; what no longer is asked for goes."""
+
+    def two_tables(values: dict[str, Any]) -> None:
+        one_row(values)
+        values["tables"].append(
+            values["tables"][0] | {"title": "Again, nominal", "evaluations": ["nominal"], "data": ["nominal"]}
+        )
+
+    matrix = changed(two_tables)
+    config = BenchmarkConfig(**vars(matrix), document=tmp_path / "report")
+    monkeypatch.setattr("hdril.benchmark.engine.start", None)  # doing a step would fail
+
+    def do(title: str, store: str, config: BenchmarkConfig = config) -> list[dict[str, Any]]:
+        part = replace(config, only=[title], store=tmp_path / store)
+        pretend(Store(part.store), part.chosen, fails)
+        benchmark_command(part)
+        return json.loads((tmp_path / "report.json").read_text())["tables"]
+
+    first = do("Again, nominal", "one")
+    assert [table["title"] for table in first] == ["Again, nominal"]
+    both = do("Lift", "two")
+    assert [table["title"] for table in both] == ["Lift", "Again, nominal"], "in the order of the matrix"
+    assert both[1] == first[0]
+    text = (tmp_path / "report.md").read_text()
+    assert text.count("Made in 0.") == 2
+    assert "on a machine, with hdril 0." in text
+    longer = changed(lambda values: (two_tables(values), values["policies"]["act"].update(steps=31)))
+    assert [table["title"] for table in do("Lift", "three", replace(config, policies=longer.policies))] == ["Lift"]
+    assert [table["title"] for table in do("Lift", "four")] == ["Lift"], "the other one was dropped"
+    with pytest.raises(ValueError, match=r"^only has no table 'Peg'; choose from: 'Lift', 'Again, nominal'$"):
+        benchmark_command(replace(config, only=["Peg"]))
+
+
+def test_tables_have_titles_that_name_their_files() -> None:
+    with pytest.raises(
+        ValueError, match=r"^tables need titles that differ in letters or digits; alike are 'Lift' and 'lift!'$"
+    ):
+        check(changed(lambda values: values["tables"].append(values["tables"][0] | {"title": "lift!"})))
 
 
 def test_on_slurm_jobs_share_the_steps_and_the_last_one_reports(
