@@ -1,4 +1,4 @@
-"""One held-out episode: what a policy commands, beside where the expert's hands are.
+"""One held-out episode: what a policy commands, beside where the expert's hands are, and what its graph attends to.
 
 ``python -m hdril.benchmark.episode --policy=CHECKPOINT --task=… --seed=… --output=FOLDER [--policy.OPTION=VALUE …]``
 """
@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hdril.evaluation.evaluate import Worker, make_job
+from hdril.env import BimanualEnv
+from hdril.evaluation.evaluate import Job, Worker, make_job
+from hdril.evaluation.lerobot_actor import LeRobotActor
 from hdril.files import write_atomically
 from hdril.simulation.actions import hand_poses
 from hdril.simulation.robots.spec import SIDES
@@ -30,7 +32,8 @@ def places(rows: NDArray[np.floating]) -> dict[str, list[list[float]]]:
 
 def play(policy: str, task: str, seed: int, overrides: Sequence[str], max_frames: int | None = None) -> dict[str, Any]:
     """An episode of a policy as plain data: the ``predicted`` places of the hands, which are its commands, and the ``true`` ones,
-    which are the noise-free expert's on the same seed; frame by frame, as long as each of the two takes.
+    which are the noise-free expert's on the same seed; frame by frame, as long as each of the two takes. And the ``attention``
+    of the policy's graph at the first frame, see :func:`first_attention`.
 
     Args:
         policy: a checkpoint's folder.
@@ -38,14 +41,34 @@ def play(policy: str, task: str, seed: int, overrides: Sequence[str], max_frames
         max_frames: frames after which the episode is cut; the task's budget unless given.
     """
     job = make_job(task, policy, seed, 1, overrides=tuple(overrides), max_frames=max_frames)
-    episode = Worker(job).play(seed)
+    worker = Worker(job)
+    episode = worker.play(seed)
     # A command of a frame leads to the state after it.
     return {
         "seed": seed,
         "success": episode.outcome.success,
         "predicted": places(episode.trace.action),
         "true": places(episode.reference.state[1:]),
+        "attention": first_attention(job, worker.env, seed),
     }
+
+
+def first_attention(job: Job, env: BimanualEnv, seed: int) -> dict[str, Any] | None:
+    """What the nodes of a policy's graph attend to after the first frame: ``nodes``, names; ``primitive``, which begins;
+    ``weights`` (N, N), of the model of that primitive: row u says how much node u takes from each, and sums to 1.
+
+    None for a policy without ``attention()``, as :class:`lerobot_policy_hdril.HDRILPolicy` has it.
+    """
+    identity = job.identity.policy
+    actor = LeRobotActor(job.checkpoint, env.task_spec, job.overrides, identity.device, identity)
+    if not hasattr(actor.policy, "attention"):
+        return None
+    observation, _ = env.reset(seed=seed)
+    actor.reset(seed)
+    actor.act(observation)
+    told = actor.policy.attention()
+    weights = told.dynamics[0].numpy(force=True).astype(float).round(3).tolist()
+    return {"nodes": told.nodes, "primitive": told.primitives[0], "weights": weights}
 
 
 def main() -> None:

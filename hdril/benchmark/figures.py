@@ -19,7 +19,7 @@ MARKERS = "osD^v<>P"
 def figures(table: Mapping[str, Any]) -> dict[str, Figure]:
     """The figures of a table of ``benchmark.json``, by what they show: ``success``; ``demonstrations`` and ``minutes``, where
     there are rows of more than one number of demonstrations, or of more than one budget of training; ``trajectories`` of
-    demonstrations and a held-out ``episode``, where the table has them."""
+    demonstrations, a held-out ``episode`` and the ``attention`` at its beginning, where the table has them."""
     found = {"success": _success(table)}
     if len({row["demonstrations"] for row in table["rows"]}) > 1:
         found["demonstrations"] = _curves(table, "demonstrations", "demonstrations", _counts)
@@ -29,7 +29,35 @@ def figures(table: Mapping[str, Any]) -> dict[str, Figure]:
         found["trajectories"] = _trajectories(table["trajectories"])
     if table["episodes"]:
         found["episode"] = _episode(table["episodes"])
+        attending = {name: each["attention"] for name, each in table["episodes"].items() if each["attention"]}
+        if attending:
+            found["attention"] = _attention(attending)
     return found
+
+
+def _attention(attending: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """A panel for each evaluation, who attends to whom in the first frame, and last a graph whose nodes attend to all alike."""
+    from matplotlib.figure import Figure
+
+    first = next(iter(attending.values()))
+    count = len(first["nodes"])
+    alike = {"nodes": first["nodes"], "weights": [[1.0 / count] * count] * count, "primitive": "uniform attention"}
+    panels = [(f"{name}\n{told['primitive']}", told) for name, told in attending.items()]
+    panels.append((alike["primitive"], alike))
+    figure = Figure(figsize=(1.5 + (1.8 + 0.16 * count) * len(panels), 1.9 + 0.16 * count), layout="constrained")
+    for axes, (title, told) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        picture = axes.imshow(told["weights"], cmap="cividis", vmin=0.0, vmax=1.0)
+        size = 8 if count <= 8 else 4
+        axes.set_xticks(range(count), told["nodes"], rotation=90, fontsize=size)
+        axes.set_yticks(range(count), told["nodes"], fontsize=size)
+        axes.set_title(title, fontsize=8)
+        axes.set(xlabel="gives", ylabel="takes")
+        for row, values in enumerate(told["weights"] if count <= 8 else []):
+            for column, value in enumerate(values):
+                shade = "black" if value > 0.6 else "white"
+                axes.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=7, color=shade)
+    figure.colorbar(picture, ax=figure.axes, label="share of attention", shrink=0.7)
+    return figure
 
 
 def _episode(episodes: Mapping[str, Mapping[str, Any]]) -> Figure:

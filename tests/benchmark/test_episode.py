@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 
 from hdril.benchmark.episode import EPISODE, main, play
-from tests.evaluation.checkpoints import experts_episode, save_replay
+from hdril.env import BimanualEnv
+from hdril.evaluation.lerobot_actor import LeRobotActor
+from hdril.tasks import get_task
+from tests.evaluation.checkpoints import experts_episode, save_hdril, save_replay
 
 SEED = 200_000
 
@@ -22,13 +25,26 @@ def test_an_expert_that_is_replayed_predicts_what_is_true(tmp_path: Path, monkey
     monkeypatch.setattr(sys, "argv", ["episode", *arguments])
     main()
     episode = json.loads((tmp_path / "out" / EPISODE).read_text())
-    assert (episode["seed"], episode["success"]) == (SEED, True)
+    assert (episode["seed"], episode["success"], episode["attention"]) == (SEED, True, None)
     for side, first in (("left", 0), ("right", 8)):
         np.testing.assert_allclose(episode["predicted"][side], expert.action[:, first : first + 3], atol=6e-4)
         np.testing.assert_allclose(episode["true"][side], expert.state[1:, first : first + 3], atol=6e-4)
     monkeypatch.setattr(sys, "argv", ["episode", *arguments, "--policy.hidden=5"])
     with pytest.raises(ValueError, match=r"policy\.hidden"):
         main()
+
+
+def test_attention_is_of_the_first_frame(dataset: Path, tmp_path: Path) -> None:
+    policy = save_hdril(tmp_path / "policy", dataset)
+    told = play(str(policy), "table_lift", SEED, [])["attention"]
+    assert told["nodes"] == ["left", "right", "table"]
+    assert told["primitive"] in get_task("table_lift").labels
+    weights = np.array(told["weights"])
+    assert weights.shape == (3, 3)
+    np.testing.assert_allclose(weights.sum(1), 1.0, atol=2e-3)
+    actor, env = LeRobotActor(str(policy), get_task("table_lift")), BimanualEnv("table_lift")
+    actor.act(env.reset(seed=SEED)[0])
+    np.testing.assert_allclose(weights, actor.policy.attention().dynamics[0].detach(), atol=6e-4)
 
 
 def test_a_policy_that_fails_is_drawn_as_long_as_it_lasts(tmp_path: Path) -> None:

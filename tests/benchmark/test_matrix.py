@@ -288,6 +288,7 @@ EPISODE = {
     "success": False,
     "predicted": {"left": [[0.1, 0.2, 0.3], [0.2, 0.2, 0.3]], "right": [[0.1, -0.2, 0.3], [0.2, -0.2, 0.3]]},
     "true": {"left": [[0.1, 0.2, 0.4]], "right": [[0.1, -0.2, 0.5]]},
+    "attention": {"nodes": ["left", "right"], "primitive": "grasp", "weights": [[0.25, 0.75], [1.0, 0.0]]},
 }
 
 
@@ -645,6 +646,11 @@ def test_a_held_out_episode_of_the_policy_that_matters_is_drawn(tmp_path: Path) 
     drawn = {str(line.get_label()): line.get_xydata() for line in right.get_lines()}
     np.testing.assert_allclose(drawn["y, predicted"], [[0, -0.2], [1, -0.2]])
     np.testing.assert_allclose(drawn["the expert"], [[0, 0.1]])
+    ours, uniform, _ = figures(table)["attention"].axes
+    assert (ours.get_title(), uniform.get_title()) == ("varied\ngrasp", "uniform attention")
+    assert [label.get_text() for label in ours.get_yticklabels()] == ["left", "right"]
+    assert [text.get_text() for text in ours.texts] == ["0.25", "0.75", "1.00", "0.00"]
+    np.testing.assert_array_equal(uniform.images[0].get_array(), np.full((2, 2), 0.5))
     plain = changed(lambda values: (draw(values), values["tables"][0].update(episode=-1)))
     assert "episode" not in figures(collect(plain, store)["tables"][0])
 
