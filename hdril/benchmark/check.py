@@ -23,7 +23,11 @@ _OF_EVALUATION = (
     "push", "shards", "shard", "executor",
 )  # fmt: skip
 """What the benchmark sets by itself, so that the matrix says what was done; or what it cannot keep track of."""
-_FRAMES, _MISHAP = "--max_frames=", "--mishap="
+_FRAMES, _MISHAP = "max_frames", "mishap"
+
+
+_LONGEST = 80
+"""Letters of a title that names files."""
 
 
 def check(matrix: Matrix) -> None:
@@ -60,6 +64,10 @@ def check(matrix: Matrix) -> None:
     for table in matrix.tables:
         _check_table(matrix, table)
     titles = [slug(table.title) for table in matrix.tables]
+    if unfit := [
+        table.title for table, name in zip(matrix.tables, titles, strict=True) if not 1 <= len(name) <= _LONGEST
+    ]:
+        raise ValueError(f"a title names files: it needs 1 to {_LONGEST} letters and digits, got {unfit[0]!r}")
     if alike := [table.title for table in matrix.tables if titles.count(slug(table.title)) > 1]:
         raise ValueError(
             f"tables need titles that differ in letters or digits; alike are {' and '.join(map(repr, alike))}"
@@ -79,8 +87,7 @@ def _check_budget(name: str, policy: PolicySpec) -> None:
 def _check_options(what: str, options: list[str], known: tuple[str, ...]) -> None:
     """Raises ValueError for an option that the benchmark sets, or that would set others unseen."""
     for option in options:
-        name = option.partition("=")[0].replace("-", "_").removeprefix("__")
-        if name in known:
+        if (name := _named(option)) in known:
             raise ValueError(f"{what}: --{name} cannot be among its options")
 
 
@@ -104,7 +111,7 @@ def _check_control(matrix: Matrix, name: str, evaluation: EvaluationSpec) -> Non
     if first != second:
         raise ValueError(f"evaluation {name}: its control {evaluation.control} is not of the same scenes")
     ours, theirs = (
-        [option for option in spec.options if not option.startswith((_FRAMES, _MISHAP))]
+        [option for option in spec.options if _named(option) not in (_FRAMES, _MISHAP)]
         for spec in (evaluation, control)
     )
     if ours != theirs:
@@ -128,7 +135,7 @@ def _frames(evaluation: EvaluationSpec) -> int:
     """Frames after which its episodes are cut."""
     given = _given(evaluation, _FRAMES)
     if given and not given.isdecimal():
-        raise ValueError(f"{_FRAMES.strip('-=')} must be a whole number of frames, got {given!r}")
+        raise ValueError(f"{_FRAMES} must be a whole number of frames, got {given!r}")
     frames = int(given) if given else None
     return identify_trials(evaluation.task, 0, 1, frames, _given(evaluation, _MISHAP)).max_frames
 
@@ -141,7 +148,13 @@ def _something_happens(evaluation: EvaluationSpec) -> bool:
 
 def _given(evaluation: EvaluationSpec, option: str) -> str:
     """What an option of an evaluation was given, the last time; empty if it was not."""
-    return next((each.removeprefix(option) for each in reversed(evaluation.options) if each.startswith(option)), "")
+    found = [each.partition("=")[2] for each in evaluation.options if _named(each) == option]
+    return found[-1] if found else ""
+
+
+def _named(option: str) -> str:
+    """An option's name as its field has it; hdril-eval takes dashes, too."""
+    return option.partition("=")[0].removeprefix("--").replace("-", "_")
 
 
 def _check_table(matrix: Matrix, table: TableSpec) -> None:

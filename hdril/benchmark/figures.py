@@ -39,20 +39,20 @@ def _attention(attending: Mapping[str, Mapping[str, Any]]) -> Figure:
     """A panel for each evaluation, who attends to whom in the first frame, and last a graph whose nodes attend to all alike."""
     from matplotlib.figure import Figure
 
-    first = next(iter(attending.values()))
-    count = len(first["nodes"])
-    alike = {"nodes": first["nodes"], "weights": [[1.0 / count] * count] * count, "primitive": "uniform attention"}
+    nodes = max((told["nodes"] for told in attending.values()), key=len)
+    count = len(nodes)
     panels = [(f"{name}\n{told['primitive']}", told) for name, told in attending.items()]
-    panels.append((alike["primitive"], alike))
+    panels.append(("uniform attention", {"nodes": nodes, "weights": [[1.0 / count] * count] * count}))
     figure = Figure(figsize=(1.5 + (1.8 + 0.16 * count) * len(panels), 1.9 + 0.16 * count), layout="constrained")
     for axes, (title, told) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         picture = axes.imshow(told["weights"], cmap="cividis", vmin=0.0, vmax=1.0)
-        size = 8 if count <= 8 else 4
-        axes.set_xticks(range(count), told["nodes"], rotation=90, fontsize=size)
-        axes.set_yticks(range(count), told["nodes"], fontsize=size)
+        few = len(told["nodes"]) <= 8
+        size = 8 if few else 4
+        axes.set_xticks(range(len(told["nodes"])), told["nodes"], rotation=90, fontsize=size)
+        axes.set_yticks(range(len(told["nodes"])), told["nodes"], fontsize=size)
         axes.set_title(title, fontsize=8)
         axes.set(xlabel="gives", ylabel="takes")
-        for row, values in enumerate(told["weights"] if count <= 8 else []):
+        for row, values in enumerate(told["weights"] if few else []):
             for column, value in enumerate(values):
                 shade = "black" if value > 0.6 else "white"
                 axes.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=7, color=shade)

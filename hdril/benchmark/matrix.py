@@ -56,8 +56,8 @@ class EvaluationSpec:
     options: list[str] = field(default_factory=list)
     """Further options of hdril-eval, such as --policy.rollout=open_loop."""
     control: str = ""
-    """The evaluation of the same seeds in which nothing happens: tables tell by how much success falls from there. It must be
-    cut after the same frames (--max_frames)."""
+    """The evaluation of the same seeds in which nothing happens, neither event nor mishap: tables tell by how much success falls
+    from there. It must be cut after the same frames (--max_frames)."""
     tuning: bool = False
     """Whether choices are made by the results. Other evaluations must have other seeds, and only a matrix that is for tuning
     has a table of these."""

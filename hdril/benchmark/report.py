@@ -54,9 +54,12 @@ def _seeds(table: Mapping[str, Any]) -> str:
 
 
 def _made(made: Mapping[str, Any]) -> str:
-    """What made a table, in a sentence."""
+    """What made a table, in sentences."""
     software = ", ".join(f"{name} {version}" for name, version in made["software"].items())
-    return f"Made in {made['hours']:.1f} hours of work on {'; '.join(made['machines'])}, with {software}."
+    return (
+        f"Its steps took {made['hours']:.2g} hours, each with one thread, on {'; '.join(made['machines'])}. A step that tables "
+        f"share counts in each of them. Evaluated with {software}."
+    )
 
 
 def _rows(table: Mapping[str, Any]) -> str:
@@ -130,8 +133,8 @@ def _falls(table: Mapping[str, Any]) -> list[str]:
     ]  # fmt: skip
     heads = ["policy", "trained on", "demonstrations", *_budget(table, None), "evaluation", "control", *_DIFFERENCE]
     told = (
-        "What an event does: each evaluation against its control, in which it does not happen. Both episodes of a seed are the "
-        f"same, bit for bit, until then. The columns tell {_what_differs(table, table['falls'], 'training')}"
+        "What an event or a mishap does: each evaluation against its control, in which it does not happen. Both episodes of a "
+        f"seed are the same, bit for bit, until then. The columns tell {_what_differs(table, table['falls'], 'training')}"
     )
     return [told, markdown_table(heads, lines)]
 

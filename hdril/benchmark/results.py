@@ -31,6 +31,10 @@ _KEPT = ("n_episodes", "n_success", "pc_success", "pc_success_ci95", "held_out",
          "dtw_cm", "pc_expert_choice", "stages_reached")  # fmt: skip
 
 
+_SHAPE = 2
+"""Of a table as data. It counts up when the report needs what older tables do not have: they are not kept then."""
+
+
 def collect(matrix: Matrix, store: Store) -> dict[str, Any]:
     """The numbers of all tables, all of whose steps are done.
 
@@ -50,18 +54,22 @@ def keep_tables(matrix: Matrix, results: dict[str, Any], before: Mapping[str, An
 
     The tables are in the order of the matrix.
     """
+    specs = {table.title: table for table in matrix.tables}
     found = {table["title"]: table for table in results["tables"]}
-    if (before.get("name"), before.get("tuning")) == (matrix.name, matrix.tuning):
-        asked = {table.title: _asked(matrix, table) for table in matrix.tables}
-        kept = {
-            table["title"]: table for table in before["tables"] if asked.get(table["title"]) == table["made"]["asked"]
-        }
-        found = kept | found
-    return results | {"tables": [found[table.title] for table in matrix.tables if table.title in found]}
+    for table in before.get("tables", []):
+        spec = specs.get(table.get("title"))
+        if spec and spec.title not in found and table.get("made", {}).get("asked") == _asked(matrix, spec):
+            found[spec.title] = table | {
+                "note": spec.note,
+                "published": spec.published,
+                "published_by": spec.published_by,
+            }
+    return results | {"tables": [found[title] for title in specs if title in found]}
 
 
 def _asked(matrix: Matrix, table: TableSpec) -> str:
-    """Digest of the definition of a table: what it names, and how that is defined."""
+    """Digest of the definition of a table, its texts aside: what it names, and how that is defined."""
+    wordless = replace(table, note="", published={}, published_by="")
     policies = [
         asdict(spec) | {"config": digest_file(spec.config)}
         for spec in (matrix.policies[name] for name in table.policies)
@@ -70,17 +78,17 @@ def _asked(matrix: Matrix, table: TableSpec) -> str:
         [asdict(known[name]) for name in names]
         for names, known in ((table.data, matrix.data), (table.evaluations, matrix.evaluations))
     )
-    return digest_json([asdict(table), data, policies, evaluations])[:SHORT]
+    return digest_json([_SHAPE, asdict(wordless), data, policies, evaluations])[:SHORT]
 
 
 def _made(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
-    """What made a table: the versions, the machines, and how many hours of one core or more the steps took."""
+    """What made a table: the versions that the evaluations used, the machines, and how many hours the steps took together."""
     steps = all_steps(replace(matrix, tables=[table]))
     done = [store.get(step) for step in in_order(steps)]
-    software = [step.settings()["software"] for step in steps if isinstance(step, Evaluate)]
+    made_from = [store.made_from(step) or {} for step in steps if isinstance(step, Evaluate)]
     return {
         "asked": _asked(matrix, table),
-        "software": {name: version for versions in software for name, version in versions.items()},
+        "software": {name: version for each in made_from for name, version in each["settings"]["software"].items()},
         "machines": sorted({each.machine for each in done}),
         "hours": round(sum(each.seconds for each in done) / 3600.0, 2),
     }

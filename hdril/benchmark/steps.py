@@ -287,7 +287,7 @@ class Evaluate(Step):
     def settings(self) -> dict[str, Any]:
         trials = {"task": self.task, "episodes": self.episodes, "first_seed": self.first_seed}
         software = evaluation_software(base_name(self.task)) | _training_software(self.policy.policy_type)
-        software |= {"results": source_software("evaluation/results.py")["hdril"]}
+        software |= {"hdril.evaluation.results": source_software("evaluation/results.py")["hdril"]}
         return trials | {"options": list(self.options), "software": software}
 
     def command(self, output: Path, inputs: Folders) -> list[str]:
@@ -324,7 +324,11 @@ class Play(Step):
 
     def command(self, output: Path, inputs: Folders) -> list[str]:
         checkpoint = self.evaluation.policy.checkpoint(inputs["policy"])
-        options = [option for option in self.evaluation.options if option.startswith(("--policy.", "--max_frames="))]
+        options = [
+            option
+            for option in self.evaluation.options
+            if option.startswith(("--policy.", "--max_frames=", "--mishap="))
+        ]
         return ["python", "-m", "hdril.benchmark.episode", f"--policy={checkpoint}", f"--task={self.evaluation.task}",
                 f"--seed={self.seed}", f"--output={output}", *options]  # fmt: skip
 

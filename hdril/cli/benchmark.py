@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+from filelock import FileLock
 from tqdm import tqdm
 
 from hdril.benchmark.check import check
@@ -22,6 +24,7 @@ from hdril.cli.common import run
 from hdril.cli.shards import log_folder
 from hdril.evaluation.checkpoint import read_json
 from hdril.execution import SlurmConfig, check_execution, submit_to_slurm
+from hdril.files import LOCK
 
 
 @dataclass
@@ -75,6 +78,7 @@ def benchmark_command(config: BenchmarkConfig) -> None:
         raise ValueError("--shards and --slurm.* are for --executor=slurm; --jobs is for this machine")
     if not config.plan:
         check_execution(config.executor, config.shards, config.slurm)
+    before = _report_before(config)
     store, wanted = Store(config.store), all_steps(config.chosen)
     if config.plan:
         _print_plan(store, wanted)
@@ -93,11 +97,30 @@ def benchmark_command(config: BenchmarkConfig) -> None:
 
         Engine(store, config.jobs, watch).run(wanted)
     results, document = collect(config.chosen, store), _document(config)
-    before = document.with_name(document.name + ".json")
-    if config.only and before.exists():
-        results = keep_tables(config, results, read_json(before))
-    write_report(document, results)
+    with FileLock(config.store / LOCK):  # another command may write other tables of the same report
+        before = _report_before(config)
+        results = keep_tables(config, results, before)
+        write_report(document, results)
+    titles = {table["title"] for table in results["tables"]}
+    if gone := [table["title"] for table in before.get("tables", []) if table["title"] not in titles]:
+        print(f"No longer in the report, because they are asked for in another way now: {', '.join(gone)}")
     print(f"Report: {document}.html, and as Markdown beside it")
+
+
+def _report_before(config: BenchmarkConfig) -> Mapping[str, Any]:
+    """The report that some tables are to be added to; empty if there is none, or all tables are to be done.
+
+    Raises:
+        ValueError: it is damaged, or of another benchmark.
+    """
+    path = _document(config).with_name(_document(config).name + ".json")
+    if not (config.only and path.exists()):
+        return {}
+    found = read_json(path)
+    ours = {"name": config.name, "tuning": config.tuning}
+    if other := {key: found.get(key) for key, value in ours.items() if found.get(key) != value}:
+        raise ValueError(f"{path} is the report of another benchmark: {other}; give another --document")
+    return found
 
 
 def _document(config: BenchmarkConfig) -> Path:

@@ -59,11 +59,11 @@ class EvalConfig(PlayOptions):
     """First seed. Seeds that the policy was trained on are refused."""
     max_frames: int | None = None
     """Frames after which an episode is cut; at least the task's horizon. By default that is its budget: the frames of the
-    task's longest plan, or three times as many where scenes vary or something may happen. With more, a policy that failed
-    may try again."""
+    task's longest plan, or three times as many where scenes vary or something may happen (a mishap, too). With more, a
+    policy that failed may try again."""
     mishap: str = ""
-    """What spoils the policy's first grasp: its actions are changed during the first primitive. hands_stay, fingers_open, or
-    hands_high (by 6 cm). Does the policy notice, and grasp again?"""
+    """What spoils the policy's first grasp: its actions are changed until the expert's first grasp of the scene would be over.
+    hands_stay, fingers_open, or hands_high (by 6 cm). Does the policy notice, and grasp again?"""
     training_data: Path | None = None
     """Folder of the dataset that the policy was trained on, if it is not found: to check that the seeds are held out. It
     must have the statistics that the checkpoint keeps. Checkpoints of hdril know their training data."""
@@ -155,7 +155,7 @@ def describe(job: Job, held_out: HeldOut) -> Run:
     if foreign := foreign_primitives(job.checkpoint, task):
         notes.append(f"Not of this task are the policy's primitives {', '.join(foreign)}: its planner is not scored.")
     if trials.mishap:
-        notes.append(describe_mishap(trials.mishap, task))
+        notes.append(describe_mishap(trials.mishap))
     return Run(
         task=job.task,
         policy=job.checkpoint.name,

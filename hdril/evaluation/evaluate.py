@@ -11,7 +11,7 @@ from hdril.env import BimanualEnv
 from hdril.evaluation.checkpoint import Checkpoint, find_checkpoint, identify, resolve_config
 from hdril.evaluation.identity import Identity, identify_trials
 from hdril.evaluation.lerobot_actor import LeRobotActor, foreign_primitives
-from hdril.evaluation.mishap import MishapActor
+from hdril.evaluation.mishap import MishapActor, first_grasp_ends
 from hdril.evaluation.reference import Reference, ReferenceCache
 from hdril.evaluation.score import Outcome, score_episode
 from hdril.trace import Trace, trace_episode
@@ -97,17 +97,17 @@ class Worker:
         identity = self.job.identity
         self.env = BimanualEnv(self.job.task, max_episode_steps=identity.trials.max_frames)
         self._references = ReferenceCache(self.job.task)
-        actor = LeRobotActor(
+        self.actor = LeRobotActor(
             self.job.checkpoint, self.env.task_spec, self.job.overrides, identity.policy.device, identity.policy
         )
-        mishap = identity.trials.mishap
-        self._actor = MishapActor(actor, mishap, self.env.task_spec) if mishap else actor
         self._foreign = foreign_primitives(self.job.checkpoint, self.env.task_spec)
 
     def play(self, seed: int) -> EvaluatedEpisode:
         """Expert and policy on the scene of ``seed``."""
         reference = self._references.get(seed)
-        trace, ending = trace_episode(self.env, self._actor, seed, reference.scripted)
+        mishap = self.job.identity.trials.mishap
+        actor = MishapActor(self.actor, mishap, first_grasp_ends(reference)) if mishap else self.actor
+        trace, ending = trace_episode(self.env, actor, seed, reference.scripted)
         outcome = score_episode(self.env.task_spec, seed, trace, reference, ending)
         if self._foreign:
             outcome = _without_planner(outcome)

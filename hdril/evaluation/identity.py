@@ -72,8 +72,8 @@ class Identity:
 def identify_trials(
     task: str, first_seed: int, num_episodes: int, max_frames: int | None = None, mishap: str = ""
 ) -> TrialsIdentity:
-    """The trials on a task's seeds from ``first_seed`` on; ``max_frames`` is the task's budget unless given. After a mishap
-    that is as many frames as where something may happen: a grasp can be tried again.
+    """The trials on a task's seeds from ``first_seed`` on; ``max_frames`` is the task's budget unless given. With a
+    mishap, an episode may last as long as where something may happen: a grasp can be tried again.
 
     Raises:
         ValueError: there is no such task or mishap, or an episode would be cut before the task's horizon, where success is
@@ -102,7 +102,7 @@ def _leaves(values: Values, path: tuple[str, ...] = ()) -> Iterator[tuple[str, A
 
 
 def _shown(value: Any) -> str:
-    text = str(value)
+    text = str(value) or "none"
     return text[:SHORT] if len(text) == 64 and " " not in text else text
 
 
@@ -114,9 +114,9 @@ def differences(there: Values, here: Values) -> list[str]:
     stored, wanted = dict(_leaves(there)), dict(_leaves(here))
     names = [*wanted, *(name for name in stored if name not in wanted)]
     return [
-        f"{name} ({_shown(stored.get(name, 'none'))} there, {_shown(wanted.get(name, 'none'))} here)"
+        f"{name} ({_shown(stored.get(name, ''))} there, {_shown(wanted.get(name, ''))} here)"
         for name in names
-        if stored.get(name) != wanted.get(name)
+        if stored.get(name, "") != wanted.get(name, "")
     ]
 
 

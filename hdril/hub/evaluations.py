@@ -78,7 +78,7 @@ def _check_unchanged(job: Job, evaluation: StoredEvaluation) -> None:
     trials, policy = job.identity.trials, job.identity.policy
     now = make_job(
         job.task, job.checkpoint, trials.first_seed, trials.num_episodes, overrides=job.overrides, device=policy.device,
-        max_frames=trials.max_frames, mishap=trials.mishap,
+        max_frames=trials.max_frames,
     )  # fmt: skip
     evaluation.require(now.identity)
 

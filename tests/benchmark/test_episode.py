@@ -34,9 +34,17 @@ def test_an_expert_that_is_replayed_predicts_what_is_true(tmp_path: Path, monkey
         main()
 
 
+def test_a_mishap_is_played(tmp_path: Path) -> None:
+    expert = experts_episode(SEED)
+    policy = str(save_replay(tmp_path / "policy", expert.action))
+    episode = play(policy, "table_lift", SEED, [], mishap="hands_high")
+    assert not episode["success"]
+    assert len(episode["predicted"]["left"]) == get_task("table_lift:level=hard").budget
+
+
 def test_attention_is_of_the_first_frame(dataset: Path, tmp_path: Path) -> None:
     policy = save_hdril(tmp_path / "policy", dataset)
-    told = play(str(policy), "table_lift", SEED, [])["attention"]
+    told = play(str(policy), "table_lift", SEED, [], mishap="hands_stay")["attention"]
     assert told["nodes"] == ["left", "right", "table"]
     assert told["primitive"] in get_task("table_lift").labels
     weights = np.array(told["weights"])

@@ -465,11 +465,34 @@ def test_what_an_event_does_is_told_against_its_control(tmp_path: Path) -> None:
             lambda e: e["calm"].update(task="table_lift"),
             "^evaluation push: its control calm observes other numbers: set detailed=1 in it$",
         ),
+        (
+            lambda e: e["calm"].update(options=["--max-frames=210", "--mishap=hands_stay"]),
+            "^evaluation push: something must happen in it, and nothing",
+        ),
+        (
+            lambda e: e["push"].update(task="table_lift:detailed=1", options=["--mishap=earthquake"]),
+            "^evaluation push: mishap must be hands_stay, fingers_open, hands_high, got 'earthquake'$",
+        ),
+        (
+            lambda e: (
+                e["push"].update(task="table_lift:detailed=1", options=["--mishap=hands_stay"]),
+                e["calm"].update(options=[]),
+            ),
+            "^evaluation push is cut after 210 frames, its control calm after 70: give",
+        ),
     ],
 )
 def test_a_control_is_of_the_same_scenes_and_as_long(change: Callable[[dict[str, Any]], object], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         check(changed(lambda values: (with_a_control(values), change(values["evaluations"]))))
+
+
+def test_a_mishap_has_a_control_as_an_event_has() -> None:
+    def spoil(values: dict[str, Any]) -> None:
+        with_a_control(values)
+        values["evaluations"]["push"].update(task="table_lift:detailed=1", options=["--mishap=hands_stay"])
+
+    check(changed(spoil))
 
 
 def test_a_table_with_an_event_has_its_control() -> None:
@@ -629,7 +652,12 @@ def test_a_held_out_episode_of_the_policy_that_matters_is_drawn(tmp_path: Path) 
     def draw(values: dict[str, Any]) -> None:
         by_minutes(values)
         values["tables"][0].update(episode=SEED, demonstrations=[10, 50])
-        values["evaluations"]["varied"]["options"] = ["--policy.rollout=open_loop", "--max_frames=9", "--device=cpu"]
+        values["evaluations"]["varied"]["options"] = [
+            "--policy.rollout=open_loop",
+            "--max_frames=9",
+            "--mishap=hands_stay",
+            "--device=cpu",
+        ]
 
     matrix, store = changed(draw), Store(tmp_path / "store")
     (play,) = [step for step in all_steps(matrix) if isinstance(step, Play)]
@@ -638,6 +666,7 @@ def test_a_held_out_episode_of_the_policy_that_matters_is_drawn(tmp_path: Path) 
     assert play.command(Path("out"), {"policy": Path("run")}) == [
         "python", "-m", "hdril.benchmark.episode", "--policy=run/checkpoints/last/pretrained_model",
         "--task=table_lift:level=varied", f"--seed={SEED}", "--output=out", "--policy.rollout=open_loop", "--max_frames=9",
+        "--mishap=hands_stay",
     ]  # fmt: skip
     pretend(store, matrix, fails)
     (table,) = collect(matrix, store)["tables"]
@@ -651,6 +680,11 @@ def test_a_held_out_episode_of_the_policy_that_matters_is_drawn(tmp_path: Path) 
     assert [label.get_text() for label in ours.get_yticklabels()] == ["left", "right"]
     assert [text.get_text() for text in ours.texts] == ["0.25", "0.75", "1.00", "0.00"]
     np.testing.assert_array_equal(uniform.images[0].get_array(), np.full((2, 2), 0.5))
+    many = {"nodes": list("abcdefghi"), "primitive": "grasp", "weights": np.eye(9).tolist()}
+    episode = table["episodes"]["varied"]
+    table["episodes"] = {"few": episode, "many": episode | {"attention": many}, "none": episode | {"attention": None}}
+    few, wide, uniform, _ = figures(table)["attention"].axes
+    assert (len(few.texts), len(wide.texts), len(uniform.get_yticklabels())) == (4, 0, 9)
     plain = changed(lambda values: (draw(values), values["tables"][0].update(episode=-1)))
     assert "episode" not in figures(collect(plain, store)["tables"][0])
 
@@ -719,38 +753,86 @@ def test_the_command_plans_and_reports_without_doing_what_is_done(
             benchmark_command(replace(config, **options))
 
 
-def test_tables_are_done_one_by_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A report grows over several commands, on machines that need not share a store; what no longer is asked for goes."""
+def two_tables(values: dict[str, Any]) -> None:
+    one_row(values)
+    second = {"title": "Again, nominal", "evaluations": ["nominal"], "data": ["nominal"]}
+    values["tables"].append(values["tables"][0] | second)
 
-    def two_tables(values: dict[str, Any]) -> None:
-        one_row(values)
-        values["tables"].append(
-            values["tables"][0] | {"title": "Again, nominal", "evaluations": ["nominal"], "data": ["nominal"]}
-        )
 
-    matrix = changed(two_tables)
-    config = BenchmarkConfig(**vars(matrix), document=tmp_path / "report")
+@pytest.fixture
+def nothing_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hdril.benchmark.engine.start", None)  # doing a step would fail
 
-    def do(title: str, store: str, config: BenchmarkConfig = config) -> list[dict[str, Any]]:
-        part = replace(config, only=[title], store=tmp_path / store)
-        pretend(Store(part.store), part.chosen, fails)
-        benchmark_command(part)
-        return json.loads((tmp_path / "report.json").read_text())["tables"]
 
-    first = do("Again, nominal", "one")
-    assert [table["title"] for table in first] == ["Again, nominal"]
-    both = do("Lift", "two")
-    assert [table["title"] for table in both] == ["Lift", "Again, nominal"], "in the order of the matrix"
-    assert both[1] == first[0]
+def do(folder: Path, title: str, store: str, change: Callable[[dict[str, Any]], object] = two_tables) -> dict[str, Any]:
+    """The report after a table was done, whose steps another folder has."""
+    matrix = changed(change)
+    part = BenchmarkConfig(**vars(matrix), document=folder / "report", store=folder / store, only=[title])
+    if not part.store.exists():
+        pretend(Store(part.store), part.chosen, fails)
+    benchmark_command(part)
+    return json.loads((folder / "report.json").read_text())
+
+
+def titles(report: dict[str, Any]) -> list[str]:
+    return [table["title"] for table in report["tables"]]
+
+
+@pytest.mark.usefixtures("nothing_is_done")
+def test_a_report_grows_table_by_table(tmp_path: Path) -> None:
+    first = do(tmp_path, "Again, nominal", "one")
+    assert titles(first) == ["Again, nominal"]
+    both = do(tmp_path, "Lift", "two")
+    assert titles(both) == ["Lift", "Again, nominal"], "in the order of the matrix"
+    assert both["tables"][1] == first["tables"][0]
+    # 1 recording, 6 trainings and 6 evaluations of 90 s.
+    assert [table["made"]["hours"] for table in both["tables"]] == [0.33, 0.33]
     text = (tmp_path / "report.md").read_text()
-    assert text.count("Made in 0.") == 2
-    assert "on a machine, with hdril 0." in text
-    longer = changed(lambda values: (two_tables(values), values["policies"]["act"].update(steps=31)))
-    assert [table["title"] for table in do("Lift", "three", replace(config, policies=longer.policies))] == ["Lift"]
-    assert [table["title"] for table in do("Lift", "four")] == ["Lift"], "the other one was dropped"
+    assert text.count("Its steps took 0.33 hours, each with one thread, on a machine.") == 2
+    assert "Evaluated with hdril 0." in text
+
+    def word(values: dict[str, Any]) -> None:
+        two_tables(values)
+        values["tables"][1]["note"] = "A better note."
+
+    assert do(tmp_path, "Lift", "two", word)["tables"][1]["note"] == "A better note."
     with pytest.raises(ValueError, match=r"^only has no table 'Peg'; choose from: 'Lift', 'Again, nominal'$"):
-        benchmark_command(replace(config, only=["Peg"]))
+        do(tmp_path, "Peg", "two")
+
+
+@pytest.mark.usefixtures("nothing_is_done")
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda values: values["policies"]["act"].update(steps=31),
+        lambda values: values["data"]["nominal"].update(perturb=0.001),
+        lambda values: values["evaluations"]["nominal"].update(options=["--max_frames=80"]),
+        lambda values: values["tables"][1].update(training_seeds=[1]),
+    ],
+)
+def test_a_table_that_is_asked_for_in_another_way_now_goes(
+    tmp_path: Path, change: Callable[[dict[str, Any]], object], capsys: pytest.CaptureFixture[str]
+) -> None:
+    do(tmp_path, "Again, nominal", "one")
+    assert titles(do(tmp_path, "Lift", "two", lambda values: (two_tables(values), change(values)))) == ["Lift"]
+    assert "because they are asked for in another way now: Again, nominal" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("nothing_is_done")
+def test_a_report_of_before_is_read_before_anything_is_done(tmp_path: Path) -> None:
+    report = tmp_path / "report.json"
+    report.write_text("{")
+    with pytest.raises(ValueError, match=r"report\.json is not valid JSON"):
+        do(tmp_path, "Lift", "two")
+    report.write_text(json.dumps({"name": "another", "tuning": False, "tables": []}))
+    with pytest.raises(
+        ValueError, match=r"report\.json is the report of another benchmark: {'name': 'another'}; give another"
+    ):
+        do(tmp_path, "Lift", "two")
+    assert json.loads(report.read_text())["name"] == "another"
+    old = {"title": "Again, nominal", "rows": []}  # by an hdril that did not tell what made a table
+    report.write_text(json.dumps({"name": "test", "tuning": False, "hdril_version": "0", "tables": [old]}))
+    assert titles(do(tmp_path, "Lift", "two")) == ["Lift"]
 
 
 def test_tables_have_titles_that_name_their_files() -> None:
@@ -758,22 +840,25 @@ def test_tables_have_titles_that_name_their_files() -> None:
         ValueError, match=r"^tables need titles that differ in letters or digits; alike are 'Lift' and 'lift!'$"
     ):
         check(changed(lambda values: values["tables"].append(values["tables"][0] | {"title": "lift!"})))
+    for title in ("…", "x" * 81):
+        with pytest.raises(ValueError, match=r"^a title names files: it needs 1 to 80 letters and digits, got"):
+            check(changed(lambda values, title=title: values["tables"][0].update(title=title)))
 
 
 def test_on_slurm_jobs_share_the_steps_and_the_last_one_reports(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    matrix, slurm = changed(one_row), FakeSlurm(tmp_path / "slurm", monkeypatch)
+    slurm = FakeSlurm(tmp_path / "slurm", monkeypatch)
     config = BenchmarkConfig(
-        **vars(matrix), store=tmp_path / "store", document=tmp_path / "report", executor="slurm", shards=3,
-        slurm=SlurmConfig("cpu"),
+        **vars(changed(two_tables)), store=tmp_path / "store", document=tmp_path / "report", executor="slurm", shards=3,
+        slurm=SlurmConfig("cpu"), only=["Lift"],
     )  # fmt: skip
     benchmark_command(config)
     shards, finish = (job for job in slurm.jobs if "launch_pickled_pipeline" in job.script)
     assert shards.options["array"] == "0-2%3"
     assert "Submitted 3 jobs as job 100" in capsys.readouterr().out
     assert not (tmp_path / "report.md").exists()
-    pretend(Store(tmp_path / "store"), matrix, fails)
+    pretend(Store(tmp_path / "store"), config.chosen, fails)
     shards.run(only=2)
     finish.run()
     assert (tmp_path / "report.md").read_text().startswith("# Benchmark: test\n")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ import pytest
 from hdril.cli.eval import EvalConfig, PolicySource, eval_command
 from hdril.evaluation.evaluate import Worker, make_job
 from hdril.evaluation.identity import identify_trials
-from hdril.evaluation.mishap import MISHAPS, frames_of
+from hdril.evaluation.mishap import MISHAPS, first_grasp_ends
+from hdril.evaluation.reference import ReferenceCache
 from hdril.evaluation.stored import read_evaluation
 from hdril.simulation.actions import hand_slice
 from hdril.simulation.robots.spec import SIDES
@@ -20,7 +22,8 @@ from hdril.trace import Trace
 from tests.evaluation.checkpoints import experts_episode, listing, save_replay
 
 SEED = 940_000
-AFTER = frames_of(get_task("table_lift"))
+AFTER = 10
+"""Frames of the expert's first grasp."""
 
 
 @pytest.fixture(scope="module")
@@ -81,14 +84,42 @@ def test_an_evaluation_says_what_happened(policy: Path, tmp_path: Path) -> None:
     assert (spoilt["n_success"], spoilt["max_frames"]) == (0, 3 * get_task("table_lift").horizon)
     assert spoilt["identity"]["trials"]["mishap"] == "hands_high"
     report = (tmp_path / "hands_high/report.md").read_text()
-    assert f"During the first {AFTER} frames, the hands arrive 6 cm too high, whatever the policy answers." in report
+    assert (
+        "Until the expert's first grasp of the scene would be over, the hands arrive 6 cm too high, whatever the policy answers."
+        in report
+    )
     assert "whatever the policy answers" not in (tmp_path / "calm/report.md").read_text()
     stored = read_evaluation(tmp_path / "hands_high")
     assert stored.job().identity.trials == identify_trials("table_lift", SEED, 1, mishap="hands_high")
     with pytest.raises(
-        ValueError, match=r"other max frames \(70 there, 210 here\), mishap \( there, hands_high here\)"
+        ValueError, match=r"other max frames \(70 there, 210 here\), mishap \(none there, hands_high here\)"
     ):
         read_evaluation(tmp_path / "calm").require_trials(stored.job().identity.trials)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_it_lasts_for_the_first_grasp_of_the_scene(task: str) -> None:
+    """In the frames before, no hand closes and goes on closed; in the primitive that ends there, one does."""
+    for seed in (SEED, SEED + 1):
+        reference = ReferenceCache(task).get(seed)
+        end = first_grasp_ends(reference)
+        labels = reference.scripted
+        assert labels[end] != labels[end - 1]
+        begin = np.flatnonzero(labels[:end] != labels[end - 1])
+        start = int(begin[-1]) + 1 if begin.size else 0
+        opening = reference.state[:, [7, 15]].min(axis=1)
+        assert opening[start] > 0.99
+        assert opening[end] < 0.95
+    never = replace(reference, state=np.ones_like(reference.state))
+    assert first_grasp_ends(never) == 0
+
+
+def test_episodes_do_not_know_of_each_other(policy: Path) -> None:
+    worker = Worker(make_job("table_lift", str(policy), SEED, 2, mishap="hands_stay"))
+    worker.play(SEED + 1)
+    again = worker.play(SEED).trace
+    worker.env.close()
+    np.testing.assert_array_equal(again.state, play(policy, "hands_stay").state)
 
 
 @pytest.mark.parametrize("task", TASKS)
