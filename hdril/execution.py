@@ -142,7 +142,7 @@ def submit_to_slurm(
         "mem_per_cpu_gb": slurm.mem_per_cpu_gb,
         "qos": slurm.qos,
         "venv_path": str(_activate()),
-        "sbatch_args": {"account": slurm.account} if slurm.account else {},
+        "sbatch_args": {"kill-on-invalid-dep": "yes"} | ({"account": slurm.account} if slurm.account else {}),
     }
 
     def executor(pipeline: list[Any], part: str, **values: Any) -> SlurmPipelineExecutor:

@@ -140,7 +140,7 @@ def test_slurm_is_asked_for_shards_and_for_a_last_job_that_plays_what_they_left(
     shards, finish = (job for job in slurm.jobs if "launch_pickled_pipeline" in job.script)
     assert shards.options.items() >= {
         "partition": "cpu", "time": "00:10:00", "mem-per-cpu": "3G", "qos": "low", "account": "lab", "array": "0-1%1",
-        "job-name": "hdril_record_shards",
+        "job-name": "hdril_record_shards", "kill-on-invalid-dep": "yes",
     }.items()  # fmt: skip
     assert "--dependency" not in shards.arguments
     assert "--dependency=afterany:100" in finish.arguments, "also after shards that failed"
