@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from hdril.errors import UserError
+from hdril.workers import worker_pool
 
 EXECUTORS = ("local", "slurm", "ray")
 
@@ -102,7 +103,7 @@ def run_on_ray(work: Work, shards: int, workers: int, folder: Path) -> None:
         ray.init(log_to_driver=False)
     shutil.rmtree(folder / "completions", ignore_errors=True)  # of an earlier run
     executor = RayPipelineExecutor(
-        _pipeline(work), tasks=shards, workers=min(workers, shards), mem_per_cpu_gb=_RAY_MEMORY,
+        _pipeline(partial(_apart, work)), tasks=shards, workers=min(workers, shards), mem_per_cpu_gb=_RAY_MEMORY,
         logging_dir=str(folder.resolve()), skip_completed=False,
     )  # fmt: skip
     executor.run()
@@ -142,7 +143,7 @@ def submit_to_slurm(
         "mem_per_cpu_gb": slurm.mem_per_cpu_gb,
         "qos": slurm.qos,
         "venv_path": str(_activate()),
-        "sbatch_args": {"account": slurm.account} if slurm.account else {},
+        "sbatch_args": {"kill-on-invalid-dep": "yes"} | ({"account": slurm.account} if slurm.account else {}),
     }
 
     def executor(pipeline: list[Any], part: str, **values: Any) -> SlurmPipelineExecutor:
@@ -185,6 +186,12 @@ def _pipeline(work: Work) -> list[Any]:
 def _step(work: Work, data: object, rank: int, world_size: int) -> None:
     """A step of a datatrove pipeline: no data goes through it."""
     work(rank, world_size)
+
+
+def _apart(work: Work, rank: int, world_size: int) -> None:
+    """Work in a process of its own: where that is killed, the shard fails. datatrove's pool on Ray would wait for it forever."""
+    with worker_pool(1) as pool:
+        pool.submit(work, rank, world_size).result()
 
 
 def _finish(finish: Callable[[], object], rank: int, world_size: int) -> None:

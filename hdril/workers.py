@@ -25,9 +25,9 @@ def worker_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     try:
         yield pool
     except BrokenProcessPool as error:
-        raise UserError(
-            f"a worker process was killed; {workers} workers may need more memory than there is: try fewer"
-        ) from error
+        cause = "it" if workers == 1 else f"{workers} workers"
+        remedy = "" if workers == 1 else ": try fewer"
+        raise UserError(f"a worker process was killed; {cause} may need more memory than there is{remedy}") from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 

@@ -6,6 +6,8 @@ import os
 import re
 import shutil
 import subprocess
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,3 +81,17 @@ def real_partition() -> str:
     if listed.returncode or not listed.stdout.split():
         pytest.skip("there is no Slurm here that answers")
     return listed.stdout.split()[0]
+
+
+def queued(folder: Path) -> list[str]:
+    """Ids of the jobs that were submitted from ``folder`` and are not over in the real Slurm."""
+    listed = subprocess.run(["squeue", "-h", "-o", "%i %Z"], capture_output=True, text=True, check=True).stdout
+    return [line.split()[0] for line in listed.splitlines() if line.split(maxsplit=1)[1] == str(folder)]
+
+
+def wait_until(happened: Callable[[], object], seconds: float = 300) -> None:
+    """Wait for what a real cluster does; fails if it does not do it in time."""
+    until = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < until, "a cluster did not do in time what the test waits for"
+        time.sleep(0.1)

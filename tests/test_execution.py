@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,8 +18,8 @@ from hdril.demonstrations.provenance import Provenance, Recipe, read_provenance
 from hdril.demonstrations.record import partial_folder, record, record_shard
 from hdril.demonstrations.shards import Shards
 from hdril.errors import UserError
-from hdril.execution import SlurmConfig, check_execution, run_on_ray, share
-from tests.fake_slurm import FakeSlurm, real_partition
+from hdril.execution import SlurmConfig, Work, check_execution, run_on_ray, share
+from tests.fake_slurm import FakeSlurm, real_partition, wait_until
 
 COUNT = 5
 RECIPE = Recipe("table_lift")
@@ -140,7 +141,7 @@ def test_slurm_is_asked_for_shards_and_for_a_last_job_that_plays_what_they_left(
     shards, finish = (job for job in slurm.jobs if "launch_pickled_pipeline" in job.script)
     assert shards.options.items() >= {
         "partition": "cpu", "time": "00:10:00", "mem-per-cpu": "3G", "qos": "low", "account": "lab", "array": "0-1%1",
-        "job-name": "hdril_record_shards",
+        "job-name": "hdril_record_shards", "kill-on-invalid-dep": "yes",
     }.items()  # fmt: skip
     assert "--dependency" not in shards.arguments
     assert "--dependency=afterany:100" in finish.arguments, "also after shards that failed"
@@ -193,11 +194,22 @@ def _break(rank: int, world_size: int) -> None:
         raise ValueError("this shard cannot be done")
 
 
+def _die(rank: int, world_size: int) -> None:
+    if rank == 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
 @pytest.mark.long
-def test_ray_says_which_shards_failed(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("work", "why"),
+    [(_break, "this shard cannot be done"), (_die, "a worker process was killed; it may need more memory")],
+    ids=["it fails", "it is killed"],
+)
+def test_ray_says_which_shards_failed(work: Work, why: str, tmp_path: Path) -> None:
     pytest.importorskip("ray", reason="Ray is an extra")
     with pytest.raises(UserError, match=r"1 of 2 shards failed, the first is 1; their logs: .*/logs"):
-        run_on_ray(_break, 2, 1, tmp_path)
+        run_on_ray(work, 2, 1, tmp_path)
+    assert why in (tmp_path / "logs/task_00001.log").read_text()
 
 
 @pytest.mark.long
@@ -205,7 +217,5 @@ def test_slurm_makes_the_same_dataset(alone: Provenance, tmp_path: Path) -> None
     root, partition = tmp_path / "set", real_partition()
     said = _record(root, "--executor=slurm", "--shards=3", f"--slurm.partition={partition}", "--slurm.mem_per_cpu_gb=1")
     assert "Submitted 3 shards as job " in said
-    waiting = time.monotonic() + 300
-    while not root.exists() and time.monotonic() < waiting:
-        time.sleep(1)
+    wait_until(root.exists)
     assert read_provenance(root) == alone

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import json
+import re
 import subprocess
 import sys
-import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
+import psutil
 import pytest
 
 from hdril.cli.eval import EvalConfig, PolicySource, eval_command
@@ -21,7 +22,7 @@ from hdril.execution import SlurmConfig
 from hdril.files import BusyError
 from tests.evaluation.checkpoints import experts_episode, listing, save_hdril, save_replay
 from tests.evaluation.synthetic import outcome
-from tests.fake_slurm import FakeSlurm, real_partition
+from tests.fake_slurm import FakeSlurm, queued, real_partition, wait_until
 
 SEED, COUNT = 930_000, 3
 
@@ -301,28 +302,104 @@ def test_slurm_is_asked_for_shards_and_for_a_last_job_that_reports(
     assert reports(output) == reports(tmp_path / "alone")
 
 
-def command(policy: Path, output: Path, *options: str) -> str:
-    line = [Path(sys.executable).with_name("hdril-eval"), f"--policy.path={policy}", f"--num_episodes={COUNT}",
-            f"--seed={SEED}", f"--output_dir={output}", "--rerun=none", "--workers=2", *options]  # fmt: skip
-    return subprocess.run(line, check=True, capture_output=True, text=True).stdout
+Command = Callable[..., list[str]]
+"""The command of an evaluation, with more options, for the working folder that the result is to be in."""
+
+
+ONE, SUITE = ("--num_episodes=6",), ("--num_episodes=2", "--suite=factors", "--cells=push")
+
+
+@pytest.fixture(scope="module", params=[ONE, SUITE], ids=["one", "suite"])
+def command(request: pytest.FixtureRequest, untrained: Path) -> Command:
+    """Asks for the folder ``eval``."""
+    program = Path(sys.executable).with_name("hdril-eval")
+    line = [str(program), f"--policy.path={untrained}", f"--seed={SEED}", "--output_dir=eval", "--rerun=none"]
+    return lambda *options: [*line, *request.param, *options]
+
+
+@pytest.fixture(scope="module")
+def whole(command: Command, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """What the command writes in one process."""
+    folder = tmp_path_factory.mktemp("whole")
+    said(command("--workers=1"), folder)
+    return reports(folder / "eval")
+
+
+only_one = pytest.mark.parametrize("command", [ONE], ids=["one"], indirect=True, scope="module")
+
+
+def said(line: list[str], folder: Path) -> str:
+    """What a command prints that runs in ``folder`` and must succeed."""
+    return subprocess.run(line, check=True, capture_output=True, text=True, cwd=folder).stdout
+
+
+def count_played(folder: Path, share: str) -> int:
+    """Episodes of a share of the evaluation ``eval`` that are kept."""
+    path = folder / "eval.partial/shards" / share / "outcomes.jsonl"
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def check_whole(folder: Path, whole: dict[str, bytes]) -> None:
+    """The results are those of one process, and nothing but logs is beside them."""
+    assert reports(folder / "eval") == whole
+    assert sorted(path.name for path in folder.iterdir()) == ["eval", "eval.jobs"]
 
 
 @pytest.mark.long
-def test_ray_gives_the_same_results(untrained: Path, tmp_path: Path) -> None:
+def test_ray_gives_the_same_results(command: Command, whole: dict[str, bytes], tmp_path: Path) -> None:
     pytest.importorskip("ray", reason="Ray is an extra")
-    command(untrained, tmp_path / "alone")
-    command(untrained, tmp_path / "eval", "--executor=ray", "--shards=3")
-    assert reports(tmp_path / "eval") == reports(tmp_path / "alone")
+    said(command("--executor=ray", "--shards=2", "--workers=2"), tmp_path)
+    check_whole(tmp_path, whole)
 
 
 @pytest.mark.long
-def test_slurm_gives_the_same_results(untrained: Path, tmp_path: Path) -> None:
-    output, partition = tmp_path / "eval", real_partition()
-    command(untrained, tmp_path / "alone")
-    said = command(untrained, output, "--executor=slurm", "--shards=3", f"--slurm.partition={partition}")
-    assert "Submitted 3 shards as job " in said
-    waiting = time.monotonic() + 300
-    while not output.exists() and time.monotonic() < waiting:
-        time.sleep(1)
-    assert reports(output) == reports(tmp_path / "alone")
-    assert len(json.loads((output / "results.json").read_text())["per_episode"]) == COUNT
+def test_slurm_gives_the_same_results(command: Command, whole: dict[str, bytes], tmp_path: Path) -> None:
+    line = command("--executor=slurm", "--shards=2", "--workers=2", f"--slurm.partition={real_partition()}")
+    assert "Submitted 2 shards as job " in said(line, tmp_path)
+    wait_until((tmp_path / "eval").exists)
+    wait_until(lambda: not queued(tmp_path))
+    check_whole(tmp_path, whole)
+
+
+@pytest.mark.long
+@only_one
+def test_ray_says_that_a_shard_was_killed_and_goes_on(
+    command: Command, whole: dict[str, bytes], tmp_path: Path
+) -> None:
+    pytest.importorskip("ray", reason="Ray is an extra")
+    line = command("--executor=ray", "--shards=2", "--workers=2")
+    with subprocess.Popen(line, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+        wait_until(lambda: count_played(tmp_path, "0-of-2"))
+        lock = str(tmp_path / "eval.partial/shards/0-of-2/lock")
+        for player in psutil.Process(process.pid).children(recursive=True):
+            if lock in (file.path for file in player.open_files()):
+                player.kill()
+        _, told = process.communicate(timeout=300)
+    assert process.returncode == 2
+    assert told.endswith("error: 1 of 2 shards failed, the first is 0; their logs: eval.jobs/logs\n")
+    assert 0 < count_played(tmp_path, "0-of-2") < 3
+    assert count_played(tmp_path, "1-of-2") == 3
+    said(line, tmp_path)
+    check_whole(tmp_path, whole)
+
+
+@pytest.mark.long
+@only_one
+def test_slurm_goes_on_where_jobs_were_cancelled_and_makes_good_what_was_killed(
+    command: Command, whole: dict[str, bytes], tmp_path: Path
+) -> None:
+    line = command("--executor=slurm", "--shards=2", "--workers=1", f"--slurm.partition={real_partition()}")
+    said(line, tmp_path)
+    wait_until(lambda: count_played(tmp_path, "0-of-2"))
+    subprocess.run(["scancel", *{job.partition("_")[0] for job in queued(tmp_path)}], check=True)
+    wait_until(lambda: not queued(tmp_path))
+    kept = count_played(tmp_path, "0-of-2")
+    assert 0 < kept < 3
+    assert not (tmp_path / "eval").exists()
+    (array,) = re.findall(r"Submitted 2 shards as job (\d+);", said(line, tmp_path))
+    wait_until(lambda: count_played(tmp_path, "1-of-2"))
+    subprocess.run(["scancel", "--signal=KILL", f"{array}_1"], check=True)
+    wait_until((tmp_path / "eval").exists)
+    wait_until(lambda: not queued(tmp_path))  # what depends on the array's success, too
+    assert listing(tmp_path / "eval.jobs/shards/completions") == {"00000": b""}, "the second shard was killed"
+    check_whole(tmp_path, whole)
