@@ -20,7 +20,7 @@ def script(task: AlohaTask, observation: Observation) -> tuple[NDArray[np.float3
     """The expert's actions (80, 16) for an episode that starts with ``observation``, and the primitive of each (80,)."""
     places = observation["environment_state"].astype(np.float64).reshape(-1, len(POSE_AXES))
     anchors = dict(zip(task.objects, places[:, :3], strict=True)) | {MEETING: np.array(task.meeting)}
-    steps = STRIDE * np.arange(1, FRAMES + 1)  # an action says where to be when its frame is over
+    steps = [STRIDE * frame for frame in range(1, FRAMES + 1)]  # an action says where to be when its frame is over
     paths = {
         side: [_command(point, anchors | {START: np.array(STARTS[side])}) for point in points]
         for side, points in task.script.items()
