@@ -13,6 +13,7 @@ ROOT = Path(__file__).parents[1]
 PICTURE = ROOT / "docs/images/architecture.svg"
 
 FLOORS = (
+    ("aloha",),
     ("cli", "lerobot_env"),
     ("benchmark", "hub", "viewer"),
     ("evaluation",),

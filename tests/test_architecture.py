@@ -32,6 +32,7 @@ BELOW: dict[str, set[str]] = {name: set() for name in BOTTOM} | {
     "benchmark": {"evaluation"},
     "lerobot_env": {"viewer"},
     "cli": {"viewer", "hub", "benchmark", "lerobot_env"},
+    "aloha": {"cli"},
 }
 """What each room may import, with everything below that. ``hdril/__init__.py`` may import tasks, to register them."""
 

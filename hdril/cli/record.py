@@ -123,7 +123,7 @@ def default_root(task: str, repo_id: str | None) -> Path:
 
 def _record_shard(recipe: Recipe, config: RecordConfig, root: Path) -> None:
     shard, shards = config.shard or 0, config.shards
-    with _progress_bar(f"recording {config.task}, shard {shard}", config.num_episodes // shards) as progress:
+    with progress_bar(f"recording {config.task}, shard {shard}", config.num_episodes // shards) as progress:
         record_shard(recipe, config.num_episodes, config.seed, root, shard, shards, config.workers, progress)
     print(f"Shard {shard} of {shards} is in {partial_folder(root)}; the same command without --shard makes the dataset")
 
@@ -155,7 +155,7 @@ def _in_words(config: RecordConfig) -> bool:
 
 
 @contextmanager
-def _progress_bar(title: str, total: int) -> Iterator[Callable[[int, int], None]]:
+def progress_bar(title: str, total: int) -> Iterator[Callable[[int, int], None]]:
     """Gives a function that shows the numbers of kept and dropped episodes."""
     with tqdm(total=max(total, 0), desc=title, unit="episode") as bar:
 
@@ -169,7 +169,7 @@ def _progress_bar(title: str, total: int) -> Iterator[Callable[[int, int], None]
 def _record(recipe: Recipe, config: RecordConfig, root: Path) -> None:
     start = time.monotonic()
     try:
-        with _progress_bar(f"recording {config.task}", config.num_episodes) as progress:
+        with progress_bar(f"recording {config.task}", config.num_episodes) as progress:
             made = record(recipe, config.num_episodes, config.seed, root, config.workers, progress, _in_words(config))
     except KeyboardInterrupt:
         print(f"\nStopped; nothing was written to {root}. Run the same command again to go on.")

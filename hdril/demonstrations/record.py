@@ -111,7 +111,7 @@ def record(
             remove_lock(partial)  # what else came there meanwhile is not of this recording
             raise
         try:
-            selection = _Selection(num_episodes, progress)
+            selection = Selection(num_episodes, progress)
             _fill(selection, shards, lambda seed: episodes(recipe, seed, workers), first_seed)
             provenance = Provenance(recipe, tuple(selection.kept), selection.dropped)
             provenance = _publish(provenance, shards, root, words)
@@ -146,7 +146,7 @@ def record_shard(
     seeds = share(range(first_seed, first_seed + num_episodes), shard, shards)
     refuse_existing(root)
     kept = Shards(partial_folder(root), recipe, first_seed)
-    selection = _Selection(num_episodes, progress)
+    selection = Selection(num_episodes, progress)
     with closing(play(recipe, [seed for seed in seeds if not kept.path(seed).exists()], workers)) as fresh:
         for episode in fresh:
             kept.put(episode)
@@ -174,7 +174,7 @@ def refuse_existing(root: Path) -> None:
         raise FileExistsError(f"{root} exists; choose another root or delete it")
 
 
-class _Selection:
+class Selection:
     """Keeps the seeds of successful episodes until there are ``wanted``, and drops the others.
 
     The episodes are on disk: of a million, memory holds none.
@@ -201,7 +201,7 @@ class _Selection:
             self._progress(len(self.kept), len(self.dropped))
 
 
-def _fill(selection: _Selection, shards: Shards, stream: Callable[[int], Generator[Episode]], first_seed: int) -> None:
+def _fill(selection: Selection, shards: Shards, stream: Callable[[int], Generator[Episode]], first_seed: int) -> None:
     """Add episodes in the order of seeds: those that are there, and new ones where one is missing."""
     seed, more = first_seed, True
     while more:

@@ -5,6 +5,7 @@ Whoever writes or reads a dataset of demonstrations takes the names from here.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from hdril.demonstrations.provenance import RECIPE_PATH, Recipe
@@ -54,23 +55,28 @@ __all__ = [
     "SUBTASK_START",
     "SUCCESS",
     "features",
+    "features_of",
 ]
 
 
 def features(recipe: Recipe) -> dict[str, dict[str, Any]]:
-    """Features of the dataset, as LeRobot declares them."""
-    objects = list(get_task(recipe.task).state_names)
+    """Features of a dataset of this recipe, as LeRobot declares them."""
+    return features_of(get_task(recipe.task).state_names)
 
-    def vector(names: list[str]) -> dict[str, Any]:
-        return {"dtype": "float32", "shape": (len(names),), "names": names}
+
+def features_of(state_names: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Features of a dataset whose :data:`ENVIRONMENT_STATE` has numbers of these names."""
+
+    def vector(names: Sequence[str]) -> dict[str, Any]:
+        return {"dtype": "float32", "shape": (len(names),), "names": list(names)}
 
     def scalar(dtype: str) -> dict[str, Any]:
         return {"dtype": dtype, "shape": (1,), "names": None}
 
     return {
-        STATE: vector(list(ACTION_NAMES)),
-        ENVIRONMENT_STATE: vector(objects),
-        ACTION: vector(list(ACTION_NAMES)),
+        STATE: vector(ACTION_NAMES),
+        ENVIRONMENT_STATE: vector(state_names),
+        ACTION: vector(ACTION_NAMES),
         SUBTASK: scalar("int64"),
         SUBTASK_START: scalar("bool"),
         REWARD: scalar("float32"),

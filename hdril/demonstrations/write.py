@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +25,7 @@ from hdril.demonstrations.schema import (
     features,
 )
 from hdril.env import BimanualEnv
-from hdril.tasks import Task, get_task
+from hdril.tasks import get_task
 
 if TYPE_CHECKING:
     import pyarrow as arrow
@@ -33,29 +33,55 @@ if TYPE_CHECKING:
     from pyarrow import parquet
 
 
+@dataclass(frozen=True)
+class Layout:
+    """What a dataset is of, beside its episodes."""
+
+    description: str
+    """The task, in words."""
+    labels: tuple[str, ...]
+    """Names of the primitives."""
+    features: Mapping[str, dict[str, Any]]
+    """As LeRobot declares them."""
+    robot: str
+    fps: int
+
+
 def write_dataset(
     root: Path, provenance: Provenance, episodes: Iterable[Episode], file_mb: int | None = None
 ) -> Provenance:
     """Write the episodes, which are those of ``provenance`` and in its order, as a new dataset at ``root``.
 
-    Returns the provenance with the digest of the episodes, as it was written. One episode is in memory at a time. A file of
-    frames is closed when it has ``file_mb`` MB or more; LeRobot's own number unless given.
+    Returns the provenance with the digest of the episodes, as it was written. Else as :func:`write_episodes`.
+    """
+    recipe = provenance.recipe
+    task, fps = get_task(recipe.task), BimanualEnv.metadata["render_fps"]
+    layout = Layout(task.description, task.labels, features(recipe), recipe.robot, fps)
+    digests = write_episodes(root, layout, episodes, file_mb)
+    provenance = replace(provenance, digest=dataset_digest(digests))
+    write_provenance(root, provenance)
+    return provenance
+
+
+def write_episodes(root: Path, layout: Layout, episodes: Iterable[Episode], file_mb: int | None = None) -> list[str]:
+    """Write the episodes as a new dataset at ``root``, which does not say how to make them again; returns their digests.
+
+    One episode is in memory at a time. A file of frames is closed when it has ``file_mb`` MB or more; LeRobot's own number
+    unless given.
 
     The tables are written here and not through ``LeRobotDataset.add_frame``, which spends most of its time on looking
     for images in each frame: this is six times as fast and gives the same files.
     """
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 
-    recipe = provenance.recipe
-    task = get_task(recipe.task)
     metadata = LeRobotDatasetMetadata.create(
         # A dataset on disk does not hold its repository's name, but LeRobot asks for one.
-        "local/dataset", BimanualEnv.metadata["render_fps"], features(recipe), recipe.robot, root, use_videos=False,
+        "local/dataset", layout.fps, dict(layout.features), layout.robot, root, use_videos=False,
         metadata_buffer_size=1000, data_files_size_in_mb=file_mb,
     )  # fmt: skip
-    metadata.save_episode_tasks([task.description])
+    metadata.save_episode_tasks([layout.description])
     try:
-        digests, frames = _write_episodes(metadata, task, episodes)
+        digests, frames = _write_frames(metadata, layout, episodes)
         metadata.finalize()
     except BaseException:
         # Otherwise it writes what it holds when it is collected, and makes the folder again, which may be removed by then.
@@ -63,14 +89,12 @@ def write_dataset(
             metadata.finalize()
         raise
     _sort_statistics(root)
-    _write_names(root, task, frames)
-    provenance = replace(provenance, digest=dataset_digest(digests))
-    write_provenance(root, provenance)
-    return provenance
+    _write_names(root, layout, frames)
+    return digests
 
 
-def _write_episodes(
-    metadata: LeRobotDatasetMetadata, task: Task, episodes: Iterable[Episode]
+def _write_frames(
+    metadata: LeRobotDatasetMetadata, layout: Layout, episodes: Iterable[Episode]
 ) -> tuple[list[str], NDArray[np.int64]]:
     """Write frames and the table of episodes; returns the digests of the episodes, and how many frames have each label."""
     import pyarrow as arrow
@@ -78,7 +102,7 @@ def _write_episodes(
     from lerobot.datasets.feature_utils import get_hf_features_from_features
 
     columns = get_hf_features_from_features(metadata.features)
-    start, digests, played = 0, [], np.zeros(len(task.labels), np.int64)
+    start, digests, played = 0, [], np.zeros(len(layout.labels), np.int64)
     with closing(_DataFiles(metadata, columns.arrow_schema)) as files:
         for index, episode in enumerate(episodes):
             frames = content(episode)
@@ -90,10 +114,10 @@ def _write_episodes(
             values: dict[str, list[str] | np.ndarray] = {key: frames[key] for key in metadata.features}
             stats = compute_episode_stats(values, metadata.features)
             told = {SEED: episode.seed, SCENARIO: episode.scenario, DIGEST: digests[-1]}
-            row = place | told | _segments(episode, task.labels)
-            metadata.save_episode(index, len(episode), [task.description], stats, row)
+            row = place | told | _segments(episode, layout.labels)
+            metadata.save_episode(index, len(episode), [layout.description], stats, row)
             start += len(episode)
-            played += np.bincount(episode.label, minlength=len(task.labels))
+            played += np.bincount(episode.label, minlength=len(layout.labels))
     return digests, played
 
 
@@ -140,15 +164,15 @@ def _sort_statistics(root: Path) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()), indent=4, sort_keys=True))
 
 
-def _write_names(root: Path, task: Task, frames: NDArray[np.int64]) -> None:
+def _write_names(root: Path, layout: Layout, frames: NDArray[np.int64]) -> None:
     """The names of task and primitives, and the primitives' shares of an episode, of which ``frames`` are played."""
     import pandas as pd
 
     # Rerun's loader looks for the column that pandas makes of an index without a name, LeRobot reads it under any name.
-    tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([task.description]))
+    tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([layout.description]))
     tasks.to_parquet(root / "meta/tasks.parquet")
-    write_primitives(root, task.labels)
-    shares = dict(zip(task.labels, (frames / frames.sum()).tolist(), strict=True))
+    write_primitives(root, layout.labels)
+    shares = dict(zip(layout.labels, (frames / frames.sum()).tolist(), strict=True))
     (root / PROPORTIONS_PATH).write_text(json.dumps(shares, indent=2))
 
 

@@ -1,0 +1,5 @@
+"""Nothing is drawn in these tests."""
+
+import os
+
+os.environ.setdefault("MUJOCO_GL", "disable")  # read when MuJoCo is imported
