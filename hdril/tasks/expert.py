@@ -44,6 +44,7 @@ class ScriptedExpert:
         self._plan: Plan | None = None
         self._missing = 0
         self._waited = 0
+        self._frame = -1
         self._last: NDArray[np.float64] | None = None
         self._label = -1
 
@@ -53,6 +54,7 @@ class ScriptedExpert:
         Raises:
             StopIteration: the primitives are over, and nothing needs to be done again; :meth:`reset` first.
         """
+        self._frame += 1
         scene, events, starts = self._look(observation), (), False
         if self._waits(scene):
             self._waited += 1
@@ -71,10 +73,14 @@ class ScriptedExpert:
         return Decision(action, Explanation(self._label, self._certain[self._label], events=events, starts=starts))
 
     def _waits(self, scene: Scene) -> bool:
-        """Whether all is done and it remains to be seen that it stays so: the hands keep still."""
+        """Whether all is done and it remains to be seen that it stays so: the hands keep still.
+
+        A plan that leaves primitives out is over before the horizon, and success is not judged until then.
+        """
         script = self.task.primitives
         over = self._plan is not None and self._plan.over and self._next >= len(script) and not self._queue
-        return over and self._waited < self.task.dwell and script[-1].possible(scene)
+        early = self._frame < self.task.horizon
+        return over and (early or self._waited < self.task.dwell) and script[-1].possible(scene)
 
     def _watch(self, plan: Plan, scene: Scene) -> tuple[str, ...]:
         """Follow what the plan follows, or give it up if what it needs is missing; says so, in words."""
