@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,10 @@ from hdril.simulation.actions import split_action
 from hdril.tasks.primitives import HINDERED, Hands, Noise, Plan, Primitive, Scene
 from hdril.tasks.task import Task
 
+LAG = 0.04
+"""m by which a hand that carries something is late where it is hindered: in undisturbed scenes it never is."""
+HOLD = 12
+"""Frames for which the hands wait for one that is late."""
 PATIENCE = 2
 """Frames for which a need must be missing before a primitive is given up: a hand may swing for one."""
 
@@ -45,6 +50,8 @@ class ScriptedExpert:
         self._missing = 0
         self._waited = 0
         self._frame = -1
+        self._carries = False
+        self._late = 0
         self._last: NDArray[np.float64] | None = None
         self._label = -1
 
@@ -60,11 +67,15 @@ class ScriptedExpert:
             self._waited += 1
             assert self._last is not None
             return Decision(self._last, Explanation(self._label, self._certain[self._label]))
+        if self._held_up(scene):
+            assert self._last is not None
+            return Decision(self._last, Explanation(self._label, self._certain[self._label]))
         if self._plan is not None and not self._plan.over:
             events = self._watch(self._plan, scene)
         if self._plan is None or self._plan.over:
             primitive, reason = self._choose(scene)
             scene = _as_measured(scene) if reason else scene
+            self._carries = _closed(scene.hands)
             self._plan, self._missing, starts = Plan(primitive, scene, self.noise, self._rng), 0, True
             events = (*events, *reason)
         action = self._last = self._plan.next()
@@ -81,6 +92,13 @@ class ScriptedExpert:
         over = self._plan is not None and self._plan.over and self._next >= len(script) and not self._queue
         early = self._frame < self.task.horizon
         return over and (early or self._waited < self.task.dwell) and script[-1].possible(scene)
+
+    def _held_up(self, scene: Scene) -> bool:
+        """Whether a hand is kept from going where it is told while both carry something: they then wait for it."""
+        carries = self._plan is not None and not self._plan.over and self._carries and _closed(scene.hands)
+        ways = [math.dist(scene.hands[side].pose.position, hand.pose.position) for side, hand in scene.measured.items()]
+        self._late = self._late + 1 if carries and max(ways) > LAG else 0
+        return 1 <= self._late <= HOLD
 
     def _watch(self, plan: Plan, scene: Scene) -> tuple[str, ...]:
         """Follow what the plan follows, or give it up if what it needs is missing; says so, in words."""
@@ -129,6 +147,11 @@ class ScriptedExpert:
             measured,
             dict(self.task.attributes) | dict(zip([n for n, _ in task.attributes], values[poses.size :], strict=False)),
         )
+
+
+def _closed(hands: Hands) -> bool:
+    """Whether both hands are told to be closed."""
+    return all(hand.opening < 0.5 for hand in hands.values())
 
 
 def _as_measured(scene: Scene) -> Scene:
