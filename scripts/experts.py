@@ -69,6 +69,11 @@ def row(task: str, cell: Cell, seeds: range, pool: Any) -> dict[str, Any]:
     }
 
 
+def _sources(version: str) -> str:
+    """The digest in "0.1.0 (8136cab8cde6)"."""
+    return version.partition("(")[2].rstrip(")")
+
+
 def markdown(rows: dict[str, dict[str, dict[str, Any]]]) -> str:
     """The tables."""
     blocks = [
@@ -78,7 +83,8 @@ def markdown(rows: dict[str, dict[str, dict[str, Any]]]) -> str:
         "Made by `python scripts/experts.py`. The expert has the noise of demonstrations. It sees exact poses and sizes: noise "
         "and delay of the observation, and events that blind the sensor, change nothing of what it does (a test compares the "
         "bits), and have no row. It does not know masses and friction. Intervals are Wilson's, 95 %. The seeds were used for "
-        "nothing else.",
+        "nothing else. The last column is a digest of the sources that decide an episode: rows of another digest than the others "
+        "were not played again since those sources changed.",
     ]
     for task, known in rows.items():
         lines = [
@@ -88,12 +94,13 @@ def markdown(rows: dict[str, dict[str, dict[str, Any]]]) -> str:
                 "{:.1f} to {:.1f} %".format(*(100 * x for x in wilson_interval(entry["successes"], entry["episodes"]))),
                 f"{TARGETS.get(entry['kind'], 99.0):g} %",
                 f"{entry['mean_frames']:.0f}",
+                _sources(entry["software"]["hdril"]),
             ]
             for name, entry in known.items()
         ]
         first = next(iter(known.values()))["first_seed"]
         blocks += [f"## {task}", f"Seeds from {first} on.",
-                   table(["scenes", "success", "95 % interval", "target", "mean frames"], lines)]  # fmt: skip
+                   table(["scenes", "success", "95 % interval", "target", "mean frames", "sources"], lines)]  # fmt: skip
     return "\n\n".join(blocks) + "\n"
 
 

@@ -16,7 +16,7 @@ from hdril.simulation.actions import HandCommand, hand_slice, join_action, split
 from hdril.simulation.robots import SIDES
 from hdril.tasks import get_task
 from hdril.tasks.events import Event
-from hdril.tasks.expert import ScriptedExpert
+from hdril.tasks.expert import HOLD, LAG, ScriptedExpert
 from hdril.tasks.primitives import Grip, Hands, Need, Noise, Primitive, Scene, Segment, grasp
 from hdril.tasks.table_lift import TASK
 from hdril.tasks.task import Task
@@ -215,6 +215,61 @@ def test_it_waits_for_the_dwell_and_then_goes_back() -> None:
     decision = stage.step()
     assert decision.explanation is not None
     assert decision.explanation.events == ("back to b: success is not possible",)
+
+
+def test_it_waits_for_the_horizon_where_its_plan_is_over_sooner() -> None:
+    """Success is not judged before. To play the last primitive again would undo it."""
+    short = replace(stay("b", 3), unless=x_above(0.5))
+    stage = Stage(script(stay("a", 2), short, stay("c", 2), dwell=1))
+    assert stage.task.horizon == 7
+    assert runs(stage.labels(7)) == [("a", 2), ("c", 5)]
+    decision = stage.step()
+    assert decision.explanation is not None
+    assert decision.explanation.events == ("back to c: success is not possible",)
+
+
+def hinder(stage: Stage, distance: float) -> Decision:
+    """A frame in which the left hand does not go all the way."""
+    decision = stage.step()
+    stage.hands = stage.hands.copy()
+    stage.hands[hand_slice("left")][:3] -= (0.0, 0.0, distance)
+    return decision
+
+
+def test_hands_that_carry_wait_for_one_that_is_held_up() -> None:
+    stage = Stage(script(grasp(GRIPS), stay("carry", 20)))
+    stage.labels(11)
+    first = hinder(stage, 0.05)
+    waiting = [hinder(stage, 0.05 * (i == 0)) for i in range(2)]
+    np.testing.assert_array_equal(waiting[0].action, first.action)
+    assert waiting[0].explanation is not None
+    assert not waiting[0].explanation.starts
+    # The hand has arrived: on with the plan.
+    after = stage.step()
+    assert np.abs(np.asarray(after.action) - first.action).max() > 1e-4
+    assert after.explanation is not None
+    assert (after.explanation.primitive, after.explanation.starts) == (1, False)
+
+
+def test_they_do_not_wait_forever_and_not_for_small_things() -> None:
+    stage = Stage(script(grasp(GRIPS), stay("carry", 20)))
+    stage.labels(11)
+    actions = np.array([hinder(stage, 0.05).action for _ in range(HOLD + 3)])
+    still = (np.abs(np.diff(actions, axis=0)).max(axis=1) < 1e-9).tolist()
+    assert still == [True] * HOLD + [False] * 2
+    stage = Stage(script(grasp(GRIPS), stay("carry", 20)))
+    stage.labels(11)
+    actions = np.array([hinder(stage, LAG / 2).action for _ in range(4)])
+    assert (np.abs(np.diff(actions, axis=0)).max(axis=1) > 1e-5).all()
+
+
+def test_hands_that_hold_nothing_do_not_wait() -> None:
+    """A hand that comes from far is late when a grasp begins: it closes all the same."""
+    for primitive in (stay("reach", 8), grasp(GRIPS)):
+        stage = Stage(script(primitive))
+        stage.labels(2)
+        actions = np.array([hinder(stage, 0.1).action for _ in range(5)])
+        assert (np.abs(np.diff(actions, axis=0)).max(axis=1) > 1e-5).all()
 
 
 def test_the_seed_decides_the_noise() -> None:
