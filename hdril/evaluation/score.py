@@ -74,12 +74,26 @@ class Outcome:
     """The scene and what happened to it, as JSON (:class:`hdril.tasks.scenario.Scenario`)."""
 
 
+LISTED = 5
+"""Times of one thing that are told one by one."""
+
+
 def in_words(happened: Sequence[tuple[int, str]], period: float) -> str:
-    """What happened or was noticed, by frame, each thing once with all its times, for a ``period`` of control in s."""
+    """What happened or was noticed, by frame, each thing once with its times, for a ``period`` of control in s.
+
+    Of many times, the first :data:`LISTED` and the last are told: a policy may try a grasp again for a minute.
+    """
     times: dict[str, list[str]] = {}
     for frame, words in happened:
         times.setdefault(words, []).append(f"{period * frame:.1f} s")
-    return "; ".join(f"{words} at {', '.join(at)}" for words, at in times.items())
+    return "; ".join(f"{words} at {_listed(at)}" for words, at in times.items())
+
+
+def _listed(times: Sequence[str]) -> str:
+    rest = times[LISTED:]
+    if len(rest) < 2:
+        return ", ".join(times)
+    return f"{', '.join(times[:LISTED])}, and {len(rest)} times more until {rest[-1]}"
 
 
 def score_episode(task: Task, seed: int, trace: Trace, reference: Reference, ending: Ending) -> Outcome:

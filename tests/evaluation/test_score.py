@@ -49,6 +49,9 @@ def test_what_the_policy_noticed_is_told_by_frame() -> None:
     assert in_words(outcome.noticed, 0.1) == "a at 0.2 s, 0.3 s; b at 0.2 s"
     assert score(trace()).noticed == ()
     assert in_words((), 0.1) == ""
+    often = [(frame, "a") for frame in range(10, 17)]
+    assert in_words(often[:6], 0.1) == "a at 1.0 s, 1.1 s, 1.2 s, 1.3 s, 1.4 s, 1.5 s"
+    assert in_words(often, 0.1) == "a at 1.0 s, 1.1 s, 1.2 s, 1.3 s, 1.4 s, and 2 times more until 1.6 s"
 
 
 def test_failures_of_inverse_kinematics_are_counted_by_frame() -> None:
