@@ -45,7 +45,7 @@ def _attention(attending: Mapping[str, Mapping[str, Any]]) -> Figure:
     panels.append(("uniform attention", {"nodes": nodes, "weights": [[1.0 / count] * count] * count}))
     figure = Figure(figsize=(1.5 + (1.8 + 0.16 * count) * len(panels), 1.9 + 0.16 * count), layout="constrained")
     for axes, (title, told) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        picture = axes.imshow(told["weights"], cmap="cividis", vmin=0.0, vmax=1.0)
+        axes.imshow(told["weights"], cmap="cividis", vmin=0.0, vmax=1.0)
         few = len(told["nodes"]) <= 8
         size = 8 if few else 4
         axes.set_xticks(range(len(told["nodes"])), told["nodes"], rotation=90, fontsize=size)
@@ -56,7 +56,7 @@ def _attention(attending: Mapping[str, Mapping[str, Any]]) -> Figure:
             for column, value in enumerate(values):
                 shade = "black" if value > 0.6 else "white"
                 axes.text(column, row, f"{value:.2f}", ha="center", va="center", fontsize=7, color=shade)
-    figure.colorbar(picture, ax=figure.axes, label="share of attention", shrink=0.7)
+    figure.colorbar(figure.axes[0].images[0], ax=figure.axes, label="share of attention", shrink=0.7)
     return figure
 
 
