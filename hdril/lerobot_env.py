@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -83,13 +84,16 @@ class HDRILEnvConfig(EnvConfig):
             from hdril.viewer.keep import check_keep
 
             check_keep("env.rerun", self.rerun)
-        factories = [partial(make_env, self.task, self.recordings, **self.gym_kwargs)] * n_envs
-        same_step = gym.vector.AutoresetMode.SAME_STEP
-        if use_async_envs and n_envs > 1:
-            vector = gym.vector.AsyncVectorEnv(factories, context="forkserver", autoreset_mode=same_step)
-        else:
-            vector = gym.vector.SyncVectorEnv(factories, autoreset_mode=same_step)
-        return {self.type: {0: vector}}
+        factory = partial(make_env, self.task, self.recordings, **self.gym_kwargs)
+        return {self.type: {0: make_vector_env(factory, n_envs, use_async_envs)}}
+
+
+def make_vector_env(factory: Callable[[], gym.Env], n_envs: int, use_async_envs: bool) -> gym.vector.VectorEnv:
+    """``n_envs`` environments that are stepped together, in processes of their own if ``use_async_envs``."""
+    same_step = gym.vector.AutoresetMode.SAME_STEP
+    if use_async_envs and n_envs > 1:
+        return gym.vector.AsyncVectorEnv([factory] * n_envs, context="forkserver", autoreset_mode=same_step)
+    return gym.vector.SyncVectorEnv([factory] * n_envs, autoreset_mode=same_step)
 
 
 def make_env(task: str, recordings: dict[str, str], **kwargs) -> gym.Env:

@@ -16,6 +16,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from hdril.aloha.env import FPS, AlohaPosesEnv
 from hdril.aloha.physics import require_extra
 from hdril.aloha.tasks import TASKS, find_task
+from hdril.lerobot_env import make_vector_env
 from hdril.simulation.actions import ACTION_NAMES
 
 
@@ -55,10 +56,5 @@ class AlohaPosesConfig(EnvConfig):
         """
         find_task(self.task or "")
         require_extra()
-        factories = [partial(AlohaPosesEnv, self.task, **self.gym_kwargs)] * n_envs
-        same_step = gym.vector.AutoresetMode.SAME_STEP
-        if use_async_envs and n_envs > 1:
-            vector = gym.vector.AsyncVectorEnv(factories, context="forkserver", autoreset_mode=same_step)
-        else:
-            vector = gym.vector.SyncVectorEnv(factories, autoreset_mode=same_step)
-        return {self.type: {0: vector}}
+        factory = partial(AlohaPosesEnv, self.task, **self.gym_kwargs)
+        return {self.type: {0: make_vector_env(factory, n_envs, use_async_envs)}}

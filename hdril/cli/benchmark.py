@@ -78,7 +78,7 @@ def benchmark_command(config: BenchmarkConfig) -> None:
         raise ValueError("--shards and --slurm.* are for --executor=slurm; --jobs is for this machine")
     if not config.plan:
         check_execution(config.executor, config.shards, config.slurm)
-    before = _report_before(config)
+    _report_before(config)  # what is wrong with it is told before anything is done
     store, wanted = Store(config.store), all_steps(config.chosen)
     if config.plan:
         _print_plan(store, wanted)
