@@ -219,8 +219,7 @@ class BimanualEnv(gym.Env):
     def _observe(self) -> dict[str, NDArray[np.float32]]:
         task = self.task_spec
         self._hands = self.controller.observe().astype(np.float32)
-        self._poses = {name: self.world.pose(name) for name in task.objects}
-        objects = self._sensor.observe(list(self._poses.values()))
+        objects = self._sensor.observe([self.world.pose(name) for name in task.objects])
         attributes = [value for _, value in task.attributes if task.detailed]
         return {
             "agent_pos": self._hands.copy(),
@@ -230,8 +229,7 @@ class BimanualEnv(gym.Env):
     def exact_observation(self) -> dict[str, NDArray[np.float32]]:
         """The observation without noise and delay, with everything that may vary between scenes: for demonstrators."""
         world = self.world
-        poses = [self._poses.get(name) or world.pose(name) for name in self._whole.objects]
-        seen = [pose.aligned_to(IDENTITY_QUATERNION).as_vector() for pose in poses]
+        seen = [world.pose(name).aligned_to(IDENTITY_QUATERNION).as_vector() for name in self._whole.objects]
         return {
             "agent_pos": self._hands.copy(),
             "environment_state": np.concatenate([*seen, [value for _, value in self._whole.attributes]]).astype(

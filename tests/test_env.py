@@ -148,13 +148,13 @@ def test_closing_goes_on_after_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ctrl-C while the simulator is given back: the command closes the environment again, and must end as interrupted."""
     env = BimanualEnv("table_lift")
     env.reset(seed=0)
-    disconnect = world.bullet.disconnect
+    empty = world.bullet.resetSimulation
 
-    def interrupted(client: int) -> None:
-        disconnect(client)
+    def interrupted(physicsClientId: int) -> None:  # noqa: N803  # the simulator's name
+        empty(physicsClientId=physicsClientId)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(world.bullet, "disconnect", interrupted)
+    monkeypatch.setattr(world.bullet, "resetSimulation", interrupted)
     with pytest.raises(KeyboardInterrupt):
         env.close()
     env.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,11 +60,12 @@ def check_action(action: NDArray[np.floating]) -> NDArray[np.float64]:
         raise ValueError(
             f"an action has {len(ACTION_NAMES)} numbers, {ACTION_NAMES[0]} to {ACTION_NAMES[-1]}; got shape {array.shape}"
         )
-    if not np.isfinite(array).all():
+    values = array.tolist()
+    if not all(map(math.isfinite, values)):
         bad = [f"{name} = {value}" for name, value in zip(ACTION_NAMES, array, strict=True) if not np.isfinite(value)]
         raise ValueError(f"the action is not finite: {', '.join(bad)}")
     for side in SIDES:
-        if np.linalg.norm(array[hand_slice(side)][3:7]) < 1e-6:
+        if math.hypot(*values[hand_slice(side)][3:7]) < 1e-6:
             raise ValueError(f"the action's {side}_ee quaternion has length 0")
     return array
 
@@ -72,7 +74,7 @@ def split_action(action: NDArray[np.floating]) -> dict[str, HandCommand]:
     """Commands by side, from 16 numbers in the order of :data:`ACTION_NAMES`. Raises as :func:`check_action`."""
     array = check_action(action)
     return {
-        side: HandCommand(Pose.from_vector(hand[:-1]), float(np.clip(hand[-1], 0.0, 1.0)))
+        side: HandCommand(Pose.from_vector(hand[:-1]), min(max(float(hand[-1]), 0.0), 1.0))
         for side, hand in zip(SIDES, array.reshape(len(SIDES), HAND_WIDTH), strict=True)
     }
 

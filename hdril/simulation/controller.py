@@ -59,7 +59,7 @@ class EndEffectorController:
         }
         self._targets = self._joint_targets(dict.fromkeys(SIDES, 1.0))
         world.reset_joints(ROBOT, self.joint_names, self._targets.tolist())
-        self._drive(self._targets)
+        self._drive(self._targets.tolist())
         self.results = {}
 
     @property
@@ -72,11 +72,10 @@ class EndEffectorController:
         fingers = [self._robot.arms[side].gripper.targets((openings | forced)[side]) for side in SIDES]
         return np.concatenate([*(self._arm_targets[side] for side in SIDES), *fingers])
 
-    def _drive(self, targets: NDArray[np.float64]) -> None:
-        values = targets.tolist()
+    def _drive(self, targets: list[float]) -> None:
         for joint, (position, _) in self._stopped.items():
-            values[joint] = position
-        self._world.drive(ROBOT, self._indices, values, self._gains, self._forces)
+            targets[joint] = position
+        self._world.drive(ROBOT, self._indices, targets, self._gains, self._forces)
 
     def apply(self, commands: dict[str, HandCommand]) -> None:
         """Run one control period towards ``commands``."""
@@ -122,9 +121,10 @@ class EndEffectorController:
     def _ramp(self, goal: NDArray[np.float64]) -> None:
         """Step the world through one control period while the motor targets move to ``goal``."""
         substeps, start, done = self._world.physics.substeps, self._targets, 0
-        for i in range(1, self.RAMP_STEPS + 1):
-            targets = start + (goal - start) * (i / self.RAMP_STEPS)
-            targets[self._arm_count :] = goal[self._arm_count :]  # fingers close at their own speed
+        fractions = np.arange(1, self.RAMP_STEPS + 1)[:, None] / self.RAMP_STEPS
+        ramp = start + (goal - start) * fractions
+        ramp[:, self._arm_count :] = goal[self._arm_count :]  # fingers close at their own speed
+        for i, targets in enumerate(ramp.tolist(), start=1):
             self._drive(targets)
             upto = i * substeps // self.RAMP_STEPS
             self._world.step(upto - done)

@@ -74,12 +74,10 @@ class Chain:
         links[:, :, 0] = cosines * self._offsets[:, :, 0] + sines * self._offsets[:, :, 1]
         links[:, :, 1] = cosines * self._offsets[:, :, 1] - sines * self._offsets[:, :, 0]
         frames = np.empty_like(links)
-        transform = links[0]
-        frames[0] = transform
+        frames[0] = links[0]
         for i in range(1, len(links)):
-            transform = transform @ links[i]
-            frames[i] = transform
-        transform = transform @ self._tool
+            np.matmul(frames[i - 1], links[i], out=frames[i])
+        transform = frames[-1] @ self._tool
         axes = frames[:, :3, 2]
         arms = transform[:3, 3] - frames[:, :3, 3]
         jacobian = np.empty((6, len(links)))

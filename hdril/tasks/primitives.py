@@ -7,13 +7,14 @@ Where a segment follows an object, the rest of the plan is made anew when that o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hdril.geometry import Pose, geodesic_distance, interpolate
+from hdril.geometry import Pose, interpolate
 from hdril.simulation.actions import HandCommand, join_action
 from hdril.simulation.robots.spec import SIDES
 
@@ -138,7 +139,7 @@ def _offsets(segment: Segment, noise: Noise, rng: np.random.Generator) -> dict[s
     return {side: noise.waypoint * segment.jitter * envelope * (wave @ draw) for side, draw in offsets.items()}
 
 
-FOLLOW_DISTANCE, FOLLOW_ANGLE = 0.005, np.deg2rad(2.0)
+FOLLOW_DISTANCE, FOLLOW_ANGLE = 0.005, math.radians(2.0)
 """A plan is made anew when an object that it follows is further than this, m and rad, from where it was planned for."""
 
 
@@ -209,8 +210,9 @@ class Plan:
 
 def _moved(before: Scene, now: Scene, name: str) -> bool:
     a, b = before.objects[name], now.objects[name]
-    far = float(np.linalg.norm(a.position - b.position)) > FOLLOW_DISTANCE
-    return far or float(geodesic_distance(a.quaternion, b.quaternion)) > FOLLOW_ANGLE
+    if math.dist(a.position, b.position) > FOLLOW_DISTANCE:
+        return True
+    return abs(float(a.quaternion @ b.quaternion)) < math.cos(0.5 * FOLLOW_ANGLE)
 
 
 # ---------------------------------------------------------------------- goals
@@ -265,7 +267,7 @@ def holds_grip(scene: Scene, side: str, grip: Grip, tolerance: float = 0.03, thi
     A hand that closes on nothing is open by less than ``thinnest`` (0 to 1).
     """
     hand = scene.measured[side]
-    near = np.linalg.norm(hand.pose.position - grip.tool(scene).position) < tolerance
+    near = math.dist(hand.pose.position, grip.tool(scene).position) < tolerance
     return bool(scene.hands[side].opening < 0.5 and thinnest < hand.opening < WIDEST and near)
 
 

@@ -31,12 +31,12 @@ class GripperSpec:
     def targets(self, opening: float) -> NDArray[np.float64]:
         """Finger positions for an opening from 0 (closed) to 1."""
         closed, opened = np.array(self.closed), np.array(self.opened)
-        return closed + np.clip(opening, 0.0, 1.0) * (opened - closed)
+        return closed + min(max(opening, 0.0), 1.0) * (opened - closed)
 
     def opening(self, positions: NDArray[np.float64]) -> float:
         """The inverse of :meth:`targets`, averaged over the fingers."""
         closed, opened = np.array(self.closed), np.array(self.opened)
-        return float(np.clip(((positions - closed) / (opened - closed)).mean(), 0.0, 1.0))
+        return min(max(float(((positions - closed) / (opened - closed)).mean()), 0.0), 1.0)
 
 
 @dataclass(frozen=True)
