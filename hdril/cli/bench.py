@@ -8,13 +8,14 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any, Literal
 from unittest.mock import patch
 
 from hdril.cli.common import run
 from hdril.demonstrations.provenance import Recipe
-from hdril.demonstrations.record import record
+from hdril.demonstrations.record import play, record
 from hdril.env import BimanualEnv
 from hdril.errors import UserError
 from hdril.rollout import run_episode
@@ -26,9 +27,9 @@ from hdril.tasks.expert import ScriptedExpert
 
 @dataclass
 class BenchConfig:
-    """Measure recording against the bare simulator, what scenes that vary cost, the loader against a training step, one
-    action, Rerun recordings against the evaluation, training against LeRobot's ACT, and HDR-IL's models called as one or one
-    by one."""
+    """Measure recording against the bare simulator, several processes against one, what scenes that vary cost, the loader against
+    a training step, one action, Rerun recordings against the evaluation, training against LeRobot's ACT, and HDR-IL's models
+    called as one or one by one."""
 
     task: str = "table_lift"
     """Name of the task, with its parameters if it has any (peg_in_hole:clearance=0.004); an unknown one is answered with
@@ -74,6 +75,27 @@ def bench_recording(task: str, episodes: int, root: Path) -> Figure:
     with patch.object(World, "step", timed_step):
         whole = _seconds(lambda: record(Recipe(task), episodes, 0, root))
     return Figure("recording, share of the bare simulator's rate", 100.0 * bare / whole, 70.0, True, "%")
+
+
+def bench_ranks(task: str, episodes: int) -> list[Figure]:
+    """Episodes a second that 2, 4 and 8 processes play, against one; the start of the processes is left out."""
+    recipe, cores, rates = Recipe(task), os.cpu_count() or 1, {}
+    for ranks in (1, 2, 4, 8):
+        with closing(play(recipe, count(), ranks)) as played:
+            for _ in range(2 * ranks):  # until each process has played its first
+                next(played)
+            rates[ranks] = episodes / _seconds(lambda: [next(played) for _ in range(episodes)])  # called at once
+    return [
+        Figure(
+            f"playing with {ranks} processes against one, {cores} cores",
+            rate / rates[1],
+            0.8 * min(ranks, cores),
+            True,
+            "times",
+        )
+        for ranks, rate in rates.items()
+        if ranks > 1
+    ]
 
 
 def bench_scenes(task: str, episodes: int) -> Figure:
@@ -245,6 +267,8 @@ def bench_command(config: BenchConfig) -> None:
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "dataset"
         print(bench_recording(config.task, config.episodes, root), flush=True)
+        for figure in bench_ranks(config.task, config.episodes):
+            print(figure, flush=True)
         print(bench_scenes(config.task, config.episodes), flush=True)
         print(bench_training(config.task, root, config.train_steps, Path(folder) / "train"), flush=True)
         print(bench_action(root, config.task), flush=True)
