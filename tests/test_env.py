@@ -155,9 +155,11 @@ def test_closing_goes_on_after_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(world.bullet, "resetSimulation", interrupted)
+    monkeypatch.setattr(world, "_idle", [])
     with pytest.raises(KeyboardInterrupt):
         env.close()
     env.close()
+    assert not world._idle
 
 
 @pytest.mark.parametrize(

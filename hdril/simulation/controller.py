@@ -73,6 +73,7 @@ class EndEffectorController:
         return np.concatenate([*(self._arm_targets[side] for side in SIDES), *fingers])
 
     def _drive(self, targets: list[float]) -> None:
+        """Set the motors' targets; those of stopped motors are replaced in the list."""
         for joint, (position, _) in self._stopped.items():
             targets[joint] = position
         self._world.drive(ROBOT, self._indices, targets, self._gains, self._forces)

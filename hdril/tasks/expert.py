@@ -38,7 +38,7 @@ class ScriptedExpert:
         self.task, self.noise = task, noise or Noise()
         self._certain = np.eye(len(task.labels), dtype=np.float32)
         self._detailed = replace(task, detailed=True)
-        self._complete = len(self._detailed.state_names)
+        self._detailed_length = len(self._detailed.state_names)
         self.reset(0)
 
     def reset(self, seed: int) -> None:
@@ -139,7 +139,7 @@ class ScriptedExpert:
     def _look(self, observation: Observation) -> Scene:
         measured = split_action(observation["agent_pos"])
         values = np.asarray(observation["environment_state"], dtype=np.float64)
-        task = self._detailed if len(values) == self._complete else self.task
+        task = self._detailed if len(values) == self._detailed_length else self.task
         poses = values[: len(POSE_AXES) * len(task.objects)].reshape(-1, len(POSE_AXES))
         seen = {name: Pose.from_vector(vector) for name, vector in zip(task.objects, poses, strict=True)}
         return Scene(

@@ -33,6 +33,6 @@ def test_a_figure_that_misses_its_limit_says_so(value: float, at_least: bool, ve
 def test_every_figure_is_measured(capsys) -> None:
     bench_command(BenchConfig(episodes=2, train_steps=20))
     lines = capsys.readouterr().out.strip().splitlines()
-    assert len(lines) == 8
+    assert len(lines) == 11
     for line in lines:
         assert re.fullmatch(r"(ok  |MISS)  .+: [\d.]+ (%|ms|times) \(at (least|most) [\d.]+\)", line), line

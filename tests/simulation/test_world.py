@@ -52,7 +52,7 @@ def _some(pairs: list[tuple[str, str]]) -> list[tuple[str, str]]:
     return [pair for pair in pairs if rng.uniform() < 0.4]
 
 
-@pytest.mark.parametrize("count", [4, 12, 28], ids=["few links", "some links", "more links than free bits"])
+@pytest.mark.parametrize("count", [4, 12, 24, 25, 28])  # of 24 links and a base, each can have a bit of its own
 def test_links_collide_unless_their_pair_is_ignored(world: World, tmp_path: Path, count: int) -> None:
     pairs = list(combinations([f"s{i}" for i in range(count)], 2))
     # Each link of a ring ignores others than the next one does, so that no two of them can share a filter.
@@ -75,13 +75,34 @@ def test_a_second_body_has_filters_of_its_own(world: World, tmp_path: Path) -> N
 
 
 def test_links_with_filters_touch_what_stands_in_the_world(world: World, tmp_path: Path) -> None:
-    world.add_urdf("spheres", _spheres(tmp_path, 2), Pose((0.0, 0.0, 1.0)), self_collision=True)
-    world.ignore_collisions("spheres", [("s0", "s1")])
+    path = _spheres(tmp_path, 2)
+    path.write_text(
+        path.read_text().replace('<link name="base">', f'<link name="base"><collision>{SPHERE}</collision>')
+    )
+    world.add_urdf("spheres", path, Pose((0.0, 0.0, 1.0)), self_collision=True)
+    world.ignore_collisions("spheres", [("s0", "s1"), ("base", "s0"), ("base", "s1")])
     world.add_body(BodySpec("floor", (Box((1.0, 1.0, 0.1), (0.0, 0.0, 0.0)),)), Pose((0.0, 0.0, 0.86)))
     world.add_body(BodySpec("block", (Box((0.1, 0.1, 0.1), (0.0, 0.0, 0.0)),), mass=1.0), Pose((0.0, 0.0, 1.14)))
     world.step()
-    for body in ("floor", "block"):
-        assert {contact.link_a for contact in world.contacts("spheres", body)} == {"s0", "s1"}
+    for body, links in (("floor", {"s0", "s1"}), ("block", {"base", "s0", "s1"})):  # a fixed base touches what can move
+        assert {contact.link_a for contact in world.contacts("spheres", body)} == links
+
+
+def test_a_file_that_changed_is_read_anew(tmp_path: Path) -> None:
+    for count in (2, 3):
+        path = _spheres(tmp_path, count).rename(tmp_path / "robot.urdf")
+        with closing(World()) as made:
+            made.add_urdf("spheres", path, Pose((0.0, 0.0, 1.0)))
+            assert made.links("spheres") == ("base", *(f"s{i}" for i in range(count)))
+
+
+def test_one_client_at_most_waits_for_the_next_world(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(simulator, "_idle", [])
+    worlds = [World() for _ in range(3)]
+    for made in worlds:
+        made.close()
+        made.close()
+        assert len(simulator._idle) == 1
 
 
 def test_an_unknown_link_cannot_be_ignored(world: World, tmp_path: Path) -> None:
