@@ -125,6 +125,7 @@ class Disturbed:
         for joint, angle in zip(self.joints, self.postures[-1] if posture is None else posture, strict=True):
             world._call("resetJointState", world._ids[ROBOT], joint, angle)
         world._call("performCollisionDetection")
+        world._poses.clear()  # as a step does
 
     def disturbances(self) -> Iterator[tuple[dict[str, Pose], dict[str, np.ndarray], np.ndarray | None]]:
         """Arms as they were at another frame; bodies pushed, moved or tilted, one by one or, to another level, together."""
