@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hdril.geometry import Pose, geodesic_distance, interpolate
+from hdril.geometry import Pose, about_z, geodesic_distance, interpolate
 from hdril.simulation.actions import HandCommand, hand_poses, openings, split_action
 from hdril.simulation.robots import SIDES
 from hdril.tasks import primitives
@@ -408,3 +409,17 @@ def test_a_primitive_of_any_length_ends_at_the_same_hands(frames: int) -> None:
         noisy = waypoints(primitive, noise=Noise(), seed=frames)
         assert primitive.frames == len(noisy) == frames
         np.testing.assert_allclose(noisy[-1], waypoints(make(12))[-1], atol=1e-9)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("degrees", "again"), [(1.9, False), (-1.9, False), (2.1, True), (-2.1, True), (90.0, True)])
+def test_a_plan_follows_an_object_that_turns(degrees: float, again: bool, sign: float) -> None:
+    body = next(iter(SCENE.objects))
+    pose = SCENE.objects[body]
+    grips = dict.fromkeys(SIDES, Grip(body, Pose((0.1, 0.0, 0.0))))
+    plan = Plan(reach("reach", grips), SCENE, QUIET, np.random.default_rng(0))
+    turned = pose @ Pose((0.0, 0.0, 0.0), about_z(np.deg2rad(degrees)))
+    turned = Pose(turned.position, sign * turned.quaternion)
+    plan.follow(replace(SCENE, objects=SCENE.objects | {body: turned}))
+    rows = np.stack([plan.next() for _ in range(plan.primitive.frames)])
+    assert again != np.array_equal(rows, waypoints(plan.primitive))
