@@ -10,6 +10,7 @@ from lerobot_policy_hdril import HDRILConfig
 from lerobot_policy_hdril.coordinates import multiply, rotate
 from lerobot_policy_hdril.dynamics import StateSkip, ridge_penalty, solve_ridge, usual_windows
 from lerobot_policy_hdril.fusion import FusedMaps, ObjectFrames
+from lerobot_policy_hdril.hand_noise import ANGLE, REST, HandNoise
 from lerobot_policy_hdril.player import Choice
 from torch import Tensor
 
@@ -174,7 +175,8 @@ def fitted(target: Any, count: int = 300) -> tuple[FusedMaps, ObjectFrames]:
     action = torch.cat([target(states), states[:, -1:]], dim=-1)[:, None]
     mask = torch.ones(count, 1, dtype=torch.bool)
     start = torch.zeros(count, dtype=torch.long)
-    maps.fit(frames.features(states), start, frames, states, action, mask, 1e-6, False)
+    seen = frames.features(states)
+    maps.fit(seen, start, frames, states, action, mask, 1e-6, False, torch.zeros(frames.dim, frames.dim))
     return maps, frames
 
 
@@ -254,3 +256,82 @@ def test_a_fused_policy_says_what_it_needs(metadata) -> None:
 def test_a_fused_plan_is_as_long_as_it_acts(metadata) -> None:
     policy = build(metadata, coordinates="fused", replan_every=2).eval()
     assert policy.predict_action_chunk(observation(metadata, [0, FRAMES])).shape == (2, 2, 16)
+
+
+# ---------------------------------------------------------------------- noise of the hands
+
+
+def test_noise_moves_the_hands_alone_and_all_states_alike() -> None:
+    names, states, std = [*HAND, "left_gripper.pos"], scenes(4000, 5).float(), torch.full((22,), 0.4)
+    states = torch.cat([states[:, :7], torch.ones(4000, 1), states[:, 7:]], dim=-1)  # the opening, and the objects
+    noise = HandNoise(names, 0.01)
+    one, other = noise([states, states + 1.0], torch.cat([std, std[:1]]), generator())
+    torch.testing.assert_close(one[:, 8:], states[:, 8:])
+    moved = one[:, :8] - states[:, :8]
+    torch.testing.assert_close((other - states - 1.0)[:, [0, 1, 2, 7]], moved[:, [0, 1, 2, 7]], atol=1e-5, rtol=0)
+    torch.testing.assert_close(moved[:, :3].std(0), torch.full((3,), 0.01), atol=5e-4, rtol=0)
+    torch.testing.assert_close(moved[:, 7].std(), torch.tensor(0.4 * REST), atol=1e-2, rtol=0)
+    torch.testing.assert_close(one[:, 3:7].norm(dim=-1), torch.ones(4000))
+    angle = 2.0 * (one[:, 3:7] * states[:, 3:7]).sum(-1).abs().clamp_max(1.0).acos()
+    torch.testing.assert_close(angle.square().mean().sqrt() / 3**0.5, torch.tensor(ANGLE * 0.01), atol=2e-3, rtol=0)
+
+
+def following(noise: float) -> tuple[Tensor, Tensor]:
+    """How much maps let the hand's position, and its opening, follow themselves, where the hand is nearly where it is told to be
+    and the place beside the cup, which it is told, is seen with errors; and the precision of the cup's frame."""
+    frames, draw = ObjectFrames([*STATE, "left_gripper.pos"], [*CUP, *SHELF, "cup.size"], ACTION).double(), generator(6)
+    maps, states = FusedMaps(frames.dim, frames, 1, 1).double(), scenes(400, 2)
+    target = at_cup(states)
+    opening = 1.0 + 1e-3 * torch.randn(400, 1, generator=draw).double()
+    action = torch.cat([target, 1.0 + 2.0 * (opening - 1.0)], dim=-1)[:, None]
+    states[:, :7] = target + 1e-3 * torch.randn(400, 7, generator=draw).double()
+    states[:, 7:10] += 5e-3 * torch.randn(400, 3, generator=draw).double()
+    states = torch.cat([states, opening], dim=-1)
+    deviations = torch.zeros(frames.dim).double()
+    deviations[:3], deviations[22] = noise, 20.0 * noise
+    start, mask = torch.zeros(400, dtype=torch.long), torch.ones(400, 1, dtype=torch.bool)
+    seen = frames.features(states)
+    seen[:, 23:] = 0.0  # the world's coordinates alone, so that one number is one way to follow
+    maps.fit(seen, start, frames, states, action, mask, 1e-6, False, torch.diag(deviations.square()))
+    gains = maps.weight[0, 0, 0, :3, :3].diagonal(), maps.plain[0, 0, 0, 22]
+    return torch.cat([gains[0], gains[1][None]]).abs(), maps.precision[0, 0, 0, 0]
+
+
+def test_maps_that_bear_noise_do_not_follow_the_hand() -> None:
+    plain, certain = following(0.0)
+    noisy, careful = following(0.02)
+    assert plain[:3].min() > 0.5  # the hand says better than the cup where it is told to go
+    assert plain[3] > 1.5  # and its opening runs away from itself
+    assert (noisy[:3] < 0.5 * plain[:3]).all()
+    assert noisy[3] < 0.1
+    assert torch.linalg.eigvalsh(certain - careful).min() > 0.0  # the noise makes the frame less certain
+
+
+def test_noise_disturbs_training_alone(metadata) -> None:
+    policy = build(metadata, preset="hdril_reactive", hidden_dim=32)
+    window = demonstrations(policy).window(BATCH, 1, policy.ahead)
+    with torch.no_grad():
+        training = [policy.train().dynamics_loss(window)[0].item() for _ in range(2)]
+        evaluation = [policy.eval().dynamics_loss(window)[0].item() for _ in range(2)]
+    assert training[0] != training[1]
+    assert evaluation[0] == evaluation[1]
+
+
+def test_the_fit_bears_the_noise(metadata) -> None:
+    """What changes a map is the option, and the same option gives the same map."""
+    quiet, noisy, again = (
+        build(metadata, preset="hdril_reactive", hidden_dim=32, **values).state_dict()
+        for values in ({"hand_noise": 0.0}, {}, {})
+    )
+    weight = next(name for name in noisy if name.startswith("fused.") and name.endswith("weight"))
+    assert torch.equal(noisy[weight], again[weight])
+    assert not torch.equal(noisy[weight], quiet[weight])
+    assert quiet.keys() == noisy.keys()  # a checkpoint from before has no noise, and loads
+
+
+@pytest.mark.parametrize("values", [{"hand_noise": -0.01, "coordinates": "fused"}, {"hand_noise": 0.01}])
+def test_noise_is_for_maps_that_are_fused(values: dict[str, Any]) -> None:
+    with pytest.raises(
+        ValueError, match=r"^policy\.hand_noise must not be negative, and is for policy\.coordinates=fused"
+    ):
+        HDRILConfig(device="cpu", push_to_hub=False, replan_every=1, **values)

@@ -43,7 +43,8 @@ class HDRILConfig(SingleFrameConfig):
     # Variant.
     preset: str = ""
     """Name of a model in :data:`~lerobot_policy_hdril.presets.PRESETS`, which then decides the values of this group, and
-    ``hidden_dim`` unless it is given; empty to set them one by one. Once the policy has learned it is a name only."""
+    ``hidden_dim``; ``hidden_dim`` and ``hand_noise`` may be given nevertheless. Empty to set them one by one. Once the policy
+    has learned it is a name only."""
     interaction: Interaction = "object"
     """Graph attention: ``none``; ``scalar``, the paper's node per number of the state; ``object``, a node per object."""
     skip: bool = True
@@ -55,6 +56,10 @@ class HDRILConfig(SingleFrameConfig):
     robust: bool = False
     """Leave out of the linear maps' fit what is far off it, and train the network with Huber's loss: in demonstrations of
     scenes where something goes wrong, some windows show how that was mended."""
+    hand_noise: float = 0.0
+    """Deviation, m, by which the measured hands are disturbed when the dynamics learn, so that they do not learn to follow
+    themselves; rotation and opening in proportion, see :class:`~lerobot_policy_hdril.hand_noise.HandNoise`. For
+    ``coordinates=fused``."""
     termination: Termination = "length"
     """When a primitive is over. ``length``: after its shortest recorded length, as soon as the planner prefers another.
     ``learned``: the planner decides at every frame whether it goes on or one begins, maybe the same again; for
@@ -188,6 +193,11 @@ class HDRILConfig(SingleFrameConfig):
                 "policy.coordinates=fused needs policy.state_skip=true, policy.rollout=closed_loop and policy.replan_every "
                 f"of at least 1; got {self.state_skip}, {self.rollout} and {self.replan_every}"
             )
+        if self.hand_noise < 0 or (self.hand_noise and self.coordinates != "fused"):
+            raise ValueError(
+                "policy.hand_noise must not be negative, and is for policy.coordinates=fused; "
+                f"got {self.hand_noise} and {self.coordinates}"
+            )
         if self.replan_every < 0:
             raise ValueError(f"policy.replan_every must be 0 (never) or more frames, got {self.replan_every}")
 
@@ -205,7 +215,7 @@ class HDRILConfig(SingleFrameConfig):
             given = getattr(self, name)
             if name not in self._given:
                 setattr(self, name, value)
-            elif given != value and name != "hidden_dim":
+            elif given != value and name not in ("hidden_dim", "hand_noise"):
                 raise ValueError(
                     f"policy.preset={self.preset} makes policy.{name} {value!r}, but {given!r} was given; leave out one"
                 )

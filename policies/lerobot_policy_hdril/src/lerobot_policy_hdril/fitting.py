@@ -21,6 +21,8 @@ from lerobot_policy_hdril.provenance import Origin, TrainingData, from_runs
 if TYPE_CHECKING:
     from lerobot_policy_hdril.modeling_hdril import HDRILPolicy
 
+NOISY_COPIES = 4
+"""Disturbed copies of each window that tell how much noise of the hands moves what the fused maps see."""
 GROWTH = 10
 """Fit anew when one new episode has come for every so many of the last fit, ..."""
 QUIET = 10
@@ -116,8 +118,9 @@ def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Te
     rows = demonstrations.replan_rows(policy.ahead, episodes)
     for k in range(len(maps)):
         window = _window(demonstrations, rows[demonstrations.label[rows] == k], policy.ahead, policy.ahead)
+        seen = policy.features(window.state, window.filtered)[0]
         cast(FusedMaps, maps[k]).fit(
-            policy.features(window.state, window.filtered)[0],
+            seen,
             torch.div(window.elapsed, policy.ahead, rounding_mode="floor"),
             frames,
             window.state,
@@ -125,7 +128,21 @@ def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Te
             window.mask,
             policy.config.ridge,
             policy.config.robust,
+            _noise_covariance(policy, window, seen),
         )
+
+
+def _noise_covariance(policy: HDRILPolicy, window: Window, seen: Tensor) -> Tensor:
+    """Second moments (D, D) of how far features (N, D) of windows are moved by noise of the hands."""
+    total = seen.new_zeros(seen.shape[1], seen.shape[1])
+    if policy.hand_noise is None or not len(seen):
+        return total
+    generator = torch.Generator(seen.device).manual_seed(0)
+    for _ in range(NOISY_COPIES):
+        noisy = policy.hand_noise([window.state, window.filtered], policy.state_std.double(), generator)
+        moved = policy.features(*noisy)[0] - seen
+        total += moved.T @ moved
+    return total / (NOISY_COPIES * len(seen))
 
 
 def _window(demonstrations: Demonstrations, rows: Tensor, stride: int, length: int) -> Window:

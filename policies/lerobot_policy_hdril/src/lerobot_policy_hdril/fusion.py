@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from lerobot_policy_hdril.coordinates import conjugate, multiply, rotate, unit
 from lerobot_policy_hdril.dynamics import ridge_penalty, solve_ridge, usual_windows
@@ -84,8 +85,8 @@ def _into(poses: Tensor, origin: Tensor) -> Tensor:
 class FusedMaps(nn.Module):
     """Linear maps from what is seen to the next actions, in every frame, and their fusion.
 
-    In frame f a map predicts a hand's pose y_f; the demonstrations' leave-one-out errors of it have the covariance S_f. With
-    the frame's origin t_f and rotation R_f in the world, the position is
+    In frame f a map predicts a hand's pose y_f; the demonstrations' leave-one-out errors of it have the covariance S_f, to which
+    noise of what is seen adds. With the frame's origin t_f and rotation R_f in the world, the position is
 
         x = (sum_f P_f)^-1 sum_f P_f (R_f y_f + t_f)        P_f = R_f S_f^-1 R_f^T
 
@@ -123,6 +124,7 @@ class FusedMaps(nn.Module):
         mask: Tensor,
         ridge: float,
         robust: bool,
+        noise: Tensor,
     ) -> None:
         """Solve the maps, in float64, see :func:`~lerobot_policy_hdril.dynamics.solve_ridge`.
 
@@ -135,23 +137,29 @@ class FusedMaps(nn.Module):
             mask: (N, M), True where there is an action.
             ridge: weight of the penalty.
             robust: leave out windows that are far off a first fit.
+            noise: covariance (D, D) of noise on the features that the maps are to bear; 0 for none. The penalty grows as if every
+                window were seen with such noise, and the covariance of a frame's errors by what the noise adds to them.
         """
         for buffer, value in ((self.weight, 0.0), (self.plain, 0.0), (self.variance, 1.0)):
             buffer.fill_(value)
         self.precision.copy_(torch.eye(3).expand_as(self.precision))
         inputs = torch.cat([seen, torch.ones_like(seen[:, :1])], dim=-1).double()
         poses, rest = frames.targets(action, state).double(), action[..., frames.rest].double()
-        penalty = ridge_penalty(inputs, ridge)
+        least, noise = ridge_penalty(inputs, ridge), F.pad(noise.double(), (0, 1, 0, 1))
         for first in start.unique().tolist():
             rows = (start == first) & mask[:, 0]
+            penalty = least + rows.sum() * noise
             if robust:
                 rows = usual_windows(inputs, action[:, 0].double(), rows, penalty)
             for step in range(mask.shape[1]):
                 here = rows & mask[:, step]
                 if here.any():
-                    self._fit_step(first, step, inputs[here], poses[:, here, step], rest[here, step], penalty)
+                    x, y = inputs[here], poses[:, here, step]
+                    self._fit_step(first, step, x, y, rest[here, step], penalty, noise)
 
-    def _fit_step(self, first: int, step: int, x: Tensor, poses: Tensor, rest: Tensor, penalty: Tensor) -> None:
+    def _fit_step(
+        self, first: int, step: int, x: Tensor, poses: Tensor, rest: Tensor, penalty: Tensor, noise: Tensor
+    ) -> None:
         """Poses (1 + F, N, G, 7) and the rest of the actions (N, A - 7 G) from x (N, D + 1)."""
         outputs = _same_signs(poses).transpose(0, 1).flatten(1)  # (N, (1 + F) G 7)
         solution, errors = solve_ridge(x, torch.cat([rest, outputs], dim=-1), penalty)
@@ -159,9 +167,14 @@ class FusedMaps(nn.Module):
         self.plain[first, step] = solution[:count].to(self.plain)
         self.weight[:, first, step] = solution[count:].unflatten(0, (len(poses), -1)).to(self.weight)
         far = errors[:, count:].unflatten(1, (len(poses), -1, 7))  # (N, 1 + F, G, 7)
-        second = torch.einsum("nfgi,nfgj->fgij", far[..., :3], far[..., :3]) / len(far)
-        self.precision[:, first, step] = torch.linalg.inv(second + _FLOOR * torch.eye(3).to(second)).to(self.precision)
-        self.variance[:, first, step] = (far[..., 3:].square().sum(-1).mean(0) + _FLOOR).to(self.variance)
+        second = torch.einsum("nfgi,nfgj->fgij", far, far) / len(far)
+        weight = solution[count:].unflatten(0, (len(poses), -1, 7))
+        second += torch.einsum("fgid,de,fgje->fgij", weight, noise, weight)
+        position, turn = second[..., :3, :3], second[..., 3:, 3:].diagonal(dim1=-2, dim2=-1).sum(-1)
+        self.precision[:, first, step] = torch.linalg.inv(position + _FLOOR * torch.eye(3).to(second)).to(
+            self.precision
+        )
+        self.variance[:, first, step] = (turn + _FLOOR).to(self.variance)
 
     def forward(self, seen: Tensor, start: Tensor, frames: ObjectFrames, origins: Tensor) -> Tensor:
         """Features (B, D) at starts (B,) of plans, and the frames' origins there (1 + F, B, 7), to actions (B, M, A) in the

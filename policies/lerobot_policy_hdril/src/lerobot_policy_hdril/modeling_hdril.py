@@ -23,6 +23,7 @@ from lerobot_policy_hdril.explain import Attention, Explanation, attend, explain
 from lerobot_policy_hdril.fitting import LearnedEpisodes, fit
 from lerobot_policy_hdril.fusion import FusedMaps, ObjectFrames
 from lerobot_policy_hdril.graph import quaternion_groups
+from lerobot_policy_hdril.hand_noise import HandNoise
 from lerobot_policy_hdril.overrides import check_overrides
 from lerobot_policy_hdril.planner import Planner
 from lerobot_policy_hdril.player import Choice, PlaybackState, advance
@@ -132,6 +133,7 @@ class HDRILPolicy(PreTrainedPolicy):
         self.relational = None
         if config.coordinates == "relational":
             self.relational = RelationalCoordinates(names, config.environment_names, [*config.action_names, *names])
+        self.hand_noise = HandNoise(config.state_names, config.hand_noise) if config.hand_noise else None
         self.frames = self.fused = None
         if fused:
             frames = self.frames = ObjectFrames(names, config.environment_names, config.action_names)
@@ -259,7 +261,10 @@ class HDRILPolicy(PreTrainedPolicy):
 
     def dynamics_loss(self, window: Window) -> tuple[Tensor, Tensor]:
         """Mean squared error and mean divergence of the latent, nats."""
-        predicted, divergence = self.predict(window.state, window.filtered, window.primitive, window.elapsed)
+        state, filtered = window.state, window.filtered
+        if self.training and self.hand_noise is not None:
+            state, filtered = self.hand_noise([state, filtered], self.state_std)
+        predicted, divergence = self.predict(state, filtered, window.primitive, window.elapsed)
         difference = predicted - self.target(window)
         if self.config.robust:  # as the linear maps' fit, it is not to follow what is far off
             error = F.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="none", beta=0.1)

@@ -46,6 +46,7 @@ def _presets() -> dict[str, dict[str, Any]]:
         "termination": "learned",
         "filter_frames": 8,
         "robust": True,
+        "hand_noise": 0.002,
         "replan_every": 1,
     }
     every["linear_reactive"] = every["hdril_reactive"] | {"decoder": "linear"}

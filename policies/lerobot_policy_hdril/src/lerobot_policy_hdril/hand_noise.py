@@ -1,0 +1,61 @@
+"""Noise on the measured hands, so that a policy does not learn to follow itself.
+
+In a demonstration, a hand is where it was told to be. Its pose and its opening tell the next action better than anything else
+does. A policy that learns this follows its own errors, and they grow. DART (Laskey et al., CoRL 2017) disturbs the robot
+while demonstrations are recorded. Here the measured hands are disturbed while the policy learns, also in rotation and opening;
+the right action stays the teacher's. What is learned so is de Haan et al.'s Causal Confusion in Imitation Learning (NeurIPS
+2019).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_policy_hdril.coordinates import multiply, unit
+from lerobot_policy_hdril.graph import pose_groups
+
+ANGLE = 5.0
+"""rad of a hand's rotation about each axis, for a metre of its position: what 1 m is seen as from 20 cm away."""
+REST = 0.5
+"""Noise of what is no pose, such as an opening, in units of its deviation over the demonstrations."""
+
+
+class HandNoise(nn.Module):
+    """Disturbs the hands in states.
+
+    Args:
+        state_names: names of the numbers of ``observation.state``, which come first in a state.
+        deviation: standard deviation of a hand's position along each axis, m.
+    """
+
+    def __init__(self, state_names: list[str], deviation: float) -> None:
+        super().__init__()
+        hands = pose_groups(state_names)
+        rest = [i for i in range(len(state_names)) if not any(i in hand for hand in hands)]
+        self.register_buffer("hands", torch.tensor(hands, dtype=torch.long).reshape(-1, 7), persistent=False)
+        self.register_buffer("rest", torch.tensor(rest, dtype=torch.long), persistent=False)
+        self.deviation = deviation
+
+    hands: Tensor  # (G, 7), columns of the state
+    rest: Tensor  # columns of the hands that are no pose's
+
+    def forward(self, states: list[Tensor], std: Tensor, generator: torch.Generator | None = None) -> list[Tensor]:
+        """The states (B, S), all disturbed alike; ``std`` (S,) is their deviation over the demonstrations."""
+
+        def normal(*size: int) -> Tensor:
+            return torch.randn(
+                len(states[0]), *size, generator=generator, dtype=states[0].dtype, device=states[0].device
+            )
+
+        shift = self.deviation * normal(len(self.hands), 3)
+        half = 0.5 * ANGLE * self.deviation * normal(len(self.hands), 3)
+        turn = unit(torch.cat([half, torch.ones_like(half[..., :1])], dim=-1))
+        rest = REST * std[self.rest] * normal(len(self.rest))
+        return [self._disturb(state, shift, turn, rest) for state in states]
+
+    def _disturb(self, state: Tensor, shift: Tensor, turn: Tensor, rest: Tensor) -> Tensor:
+        poses, result = state[:, self.hands], state.clone()
+        result[:, self.hands] = torch.cat([poses[..., :3] + shift, multiply(turn, poses[..., 3:])], dim=-1)
+        result[:, self.rest] = state[:, self.rest] + rest
+        return result
