@@ -1,10 +1,9 @@
 """Noise on the measured hands, so that a policy does not learn to follow itself.
 
 In a demonstration, a hand is where it was told to be. Its pose and its opening tell the next action better than anything else
-does. A policy that learns this follows its own errors, and they grow. DART (Laskey et al., CoRL 2017) disturbs the robot
-while demonstrations are recorded. Here the measured hands are disturbed while the policy learns, also in rotation and opening;
-the right action stays the teacher's. What is learned so is de Haan et al.'s Causal Confusion in Imitation Learning (NeurIPS
-2019).
+does. A policy that learns this follows its own errors, and they grow: causal confusion (de Haan et al., NeurIPS 2019). DART
+(Laskey et al., CoRL 2017) disturbs the robot while demonstrations are recorded. Here the measured hands are disturbed while the
+policy learns, also in rotation and opening, and the right action stays the teacher's.
 """
 
 from __future__ import annotations
@@ -16,7 +15,8 @@ from lerobot_policy_hdril.coordinates import multiply, unit
 from lerobot_policy_hdril.graph import pose_groups
 
 ANGLE = 5.0
-"""rad of a hand's rotation about each axis, for a metre of its position: what 1 m is seen as from 20 cm away."""
+"""Deviation of the rotation about each axis, in rad for each metre of that of the position: a point 20 cm from the wrist moves as
+far by the one as by the other."""
 REST = 0.5
 """Noise of what is no pose, such as an opening, in units of its deviation over the demonstrations."""
 
