@@ -58,8 +58,8 @@ class HDRILConfig(SingleFrameConfig):
     scenes where something goes wrong, some windows show how that was mended."""
     hand_noise: float = 0.0
     """Deviation, m, by which the measured hands are disturbed when the dynamics learn, so that they do not learn to follow
-    themselves; rotation and opening in proportion, see :class:`~lerobot_policy_hdril.hand_noise.HandNoise`. For
-    ``coordinates=fused``."""
+    themselves; 0: not at all. Rotations are disturbed in proportion. What is no pose, such as an opening, is disturbed by half
+    its deviation whatever the value, see :class:`~lerobot_policy_hdril.hand_noise.HandNoise`. For ``coordinates=fused``."""
     termination: Termination = "length"
     """When a primitive is over. ``length``: after its shortest recorded length, as soon as the planner prefers another.
     ``learned``: the planner decides at every frame whether it goes on or one begins, maybe the same again; for
