@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
 from lerobot_policy_hdril import HDRILConfig
-from lerobot_policy_hdril.coordinates import multiply, rotate
+from lerobot_policy_hdril.coordinates import conjugate, multiply, rotate
 from lerobot_policy_hdril.dynamics import StateSkip, ridge_penalty, solve_ridge, usual_windows
+from lerobot_policy_hdril.fitting import noise_covariance
 from lerobot_policy_hdril.fusion import FusedMaps, ObjectFrames
 from lerobot_policy_hdril.hand_noise import ANGLE, REST, HandNoise
 from lerobot_policy_hdril.player import Choice
 from torch import Tensor
+from torch.nn import functional as F
 
 from tests.policies.test_player import Scripted, play
 from tests.policies.tools import BATCH, FRAMES, STARTS, Training, build, demonstrations, observation
@@ -262,23 +265,31 @@ def test_a_fused_plan_is_as_long_as_it_acts(metadata) -> None:
 
 
 def test_noise_moves_the_hands_alone_and_all_states_alike() -> None:
-    names, states, std = [*HAND, "left_gripper.pos"], scenes(4000, 5).float(), torch.full((22,), 0.4)
-    states = torch.cat([states[:, :7], torch.ones(4000, 1), states[:, 7:]], dim=-1)  # the opening, and the objects
-    noise = HandNoise(names, 0.01)
-    one, other = noise([states, states + 1.0], torch.cat([std, std[:1]]), generator())
-    torch.testing.assert_close(one[:, 8:], states[:, 8:])
-    moved = one[:, :8] - states[:, :8]
-    torch.testing.assert_close((other - states - 1.0)[:, [0, 1, 2, 7]], moved[:, [0, 1, 2, 7]], atol=1e-5, rtol=0)
-    torch.testing.assert_close(moved[:, :3].std(0), torch.full((3,), 0.01), atol=5e-4, rtol=0)
-    torch.testing.assert_close(moved[:, 7].std(), torch.tensor(0.4 * REST), atol=1e-2, rtol=0)
-    torch.testing.assert_close(one[:, 3:7].norm(dim=-1), torch.ones(4000))
-    angle = 2.0 * (one[:, 3:7] * states[:, 3:7]).sum(-1).abs().clamp_max(1.0).acos()
-    torch.testing.assert_close(angle.square().mean().sqrt() / 3**0.5, torch.tensor(ANGLE * 0.01), atol=2e-3, rtol=0)
+    names = [f"{side}_{name}" for side in ("left", "right") for name in ["gripper.pos", *(f"ee.{a}" for a in POSE)]]
+    openings, places, turns = [0, 8], [1, 2, 3, 9, 10, 11], [[4, 5, 6, 7], [12, 13, 14, 15]]
+    states = torch.rand(20_000, 23, generator=generator(5))
+    for columns in turns:
+        states[:, columns] = turned(20_000, 1.0, generator(6)).float()
+    std = torch.linspace(0.1, 1.0, 23)
+    one, same = HandNoise(names, 0.01)([states, states], std, generator())
+    assert torch.equal(one, same)
+    assert torch.equal(one[:, 16:], states[:, 16:])
+    moved = (one - states)[:, [*openings, *places]]
+    angles = []
+    for columns in turns:
+        torch.testing.assert_close(one[:, columns].norm(dim=-1), torch.ones(20_000))
+        angles.append(2.0 * multiply(one[:, columns], conjugate(states[:, columns]))[:, :3])
+    everything = torch.cat([moved, *angles], dim=-1)
+    deviations = torch.cat([REST * std[openings], torch.full((6,), 0.01), torch.full((6,), 0.01 * ANGLE)])
+    torch.testing.assert_close(everything.std(0) / deviations, torch.ones(14), atol=0.03, rtol=0)
+    assert (everything.mean(0) / deviations).abs().max() < 0.03
+    assert (torch.corrcoef(everything.T) - torch.eye(14)).abs().max() < 0.04  # a draw of its own for each
 
 
-def following(noise: float) -> tuple[Tensor, Tensor]:
-    """How much maps let the hand's position, and its opening, follow themselves, where the hand is nearly where it is told to be
-    and the place beside the cup, which it is told, is seen with errors; and the precision of the cup's frame."""
+def following(noise: float) -> tuple[FusedMaps, Tensor, Tensor, Tensor]:
+    """Maps that bear noise of the hand, which is nearly where it is told to be: beside the cup, which is seen with errors.
+
+    With them, what was seen, the hand's pose in the action, and the covariance of the noise."""
     frames, draw = ObjectFrames([*STATE, "left_gripper.pos"], [*CUP, *SHELF, "cup.size"], ACTION).double(), generator(6)
     maps, states = FusedMaps(frames.dim, frames, 1, 1).double(), scenes(400, 2)
     target = at_cup(states)
@@ -288,45 +299,70 @@ def following(noise: float) -> tuple[Tensor, Tensor]:
     states[:, 7:10] += 5e-3 * torch.randn(400, 3, generator=draw).double()
     states = torch.cat([states, opening], dim=-1)
     deviations = torch.zeros(frames.dim).double()
-    deviations[:3], deviations[22] = noise, 20.0 * noise
+    deviations[:7], deviations[22] = noise, 20.0 * noise
     start, mask = torch.zeros(400, dtype=torch.long), torch.ones(400, 1, dtype=torch.bool)
-    seen = frames.features(states)
+    seen, covariance = frames.features(states), torch.diag(deviations.square())
     seen[:, 23:] = 0.0  # the world's coordinates alone, so that one number is one way to follow
-    maps.fit(seen, start, frames, states, action, mask, 1e-6, False, torch.diag(deviations.square()))
-    gains = maps.weight[0, 0, 0, :3, :3].diagonal(), maps.plain[0, 0, 0, 22]
-    return torch.cat([gains[0], gains[1][None]]).abs(), maps.precision[0, 0, 0, 0]
+    maps.fit(seen, start, frames, states, action, mask, 1e-6, False, covariance)
+    return maps, seen, target, covariance
 
 
 def test_maps_that_bear_noise_do_not_follow_the_hand() -> None:
-    plain, certain = following(0.0)
-    noisy, careful = following(0.02)
-    assert plain[:3].min() > 0.5  # the hand says better than the cup where it is told to go
-    assert plain[3] > 1.5  # and its opening runs away from itself
-    assert (noisy[:3] < 0.5 * plain[:3]).all()
-    assert noisy[3] < 0.1
-    assert torch.linalg.eigvalsh(certain - careful).min() > 0.0  # the noise makes the frame less certain
+    plain, noisy = following(0.0)[0], following(0.02)[0]
+    gains = [maps.weight[0, 0, 0, :3, :3].diagonal().abs() for maps in (plain, noisy)]
+    assert gains[0].min() > 0.5  # the hand says better than the cup where it is told to go
+    assert (gains[1] < 0.5 * gains[0]).all()
+    assert plain.plain[0, 0, 0, 22] > 1.5  # and its opening runs away from itself
+    assert noisy.plain[0, 0, 0, 22].abs() < 0.1
+
+
+def test_a_frame_is_as_uncertain_as_its_errors_and_the_noise_make_it() -> None:
+    maps, seen, target, covariance = following(0.02)
+    x, noise = torch.cat([seen, torch.ones(400, 1).double()], dim=-1), F.pad(covariance, (0, 1, 0, 1))
+    weight, errors = solve_ridge(x, target, ridge_penalty(x, 1e-6) + 400 * noise)
+    second = errors.T @ errors / 400 + weight @ noise @ weight.T
+    torch.testing.assert_close(maps.weight[0, 0, 0], weight)
+    torch.testing.assert_close(torch.linalg.inv(maps.precision[0, 0, 0, 0]), second[:3, :3] + 1e-7 * torch.eye(3))
+    torch.testing.assert_close(maps.variance[0, 0, 0, 0], second[3:, 3:].trace() + 1e-7)
 
 
 def test_noise_disturbs_training_alone(metadata) -> None:
+    """By what the batch decides: not by how often the generator of PyTorch was asked before."""
     policy = build(metadata, preset="hdril_reactive", hidden_dim=32)
-    window = demonstrations(policy).window(BATCH, 1, policy.ahead)
-    with torch.no_grad():
-        training = [policy.train().dynamics_loss(window)[0].item() for _ in range(2)]
-        evaluation = [policy.eval().dynamics_loss(window)[0].item() for _ in range(2)]
-    assert training[0] != training[1]
-    assert evaluation[0] == evaluation[1]
+    quiet = build(metadata, preset="hdril_reactive", hidden_dim=32)
+    quiet.hand_noise = None
+    quiet.load_state_dict(policy.state_dict())
+
+    def losses(training: bool) -> list[float]:
+        with torch.no_grad():
+            return [p.train(training).forward({"index": BATCH})[1]["dynamics_loss"] for p in (policy, policy, quiet)]
+
+    before = torch.get_rng_state()
+    noisy, again, without = losses(training=True)
+    assert noisy == again != without
+    assert len(set(losses(training=False))) == 1
+    assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_the_fit_bears_the_noise(metadata) -> None:
-    """What changes a map is the option, and the same option gives the same map."""
+def test_the_fit_bears_the_noise_that_the_option_asks_for(metadata) -> None:
     quiet, noisy, again = (
-        build(metadata, preset="hdril_reactive", hidden_dim=32, **values).state_dict()
-        for values in ({"hand_noise": 0.0}, {}, {})
+        build(metadata, preset="hdril_reactive", hidden_dim=32, **values) for values in ({"hand_noise": 0.0}, {}, {})
     )
-    weight = next(name for name in noisy if name.startswith("fused.") and name.endswith("weight"))
-    assert torch.equal(noisy[weight], again[weight])
-    assert not torch.equal(noisy[weight], quiet[weight])
-    assert quiet.keys() == noisy.keys()  # a checkpoint from before has no noise, and loads
+    for maps, others in zip(noisy.fused, again.fused, strict=True):
+        assert torch.equal(maps.weight, others.weight)
+    assert not torch.equal(noisy.fused[0].weight, quiet.fused[0].weight)
+    assert quiet.state_dict().keys() == noisy.state_dict().keys()
+    data = demonstrations(noisy)
+    window = data.window(data.replan_rows(1, torch.ones(6, dtype=torch.bool)), 1, 1)
+    window = replace(window, state=window.state.double(), filtered=window.filtered.double())
+    covariance = noise_covariance(noisy, window, noisy.features(window.state, window.filtered)[0])
+    place = noisy.config.state_names.index("left_ee.x")
+    half = len(noisy.feature_std)
+    for column in (place, half + place):  # of the present state, and of the mean of the last ones
+        expected = (0.002 / noisy.feature_std[place].double()) ** 2
+        torch.testing.assert_close(covariance[column, column], expected, rtol=0.15, atol=0)
+    table = noisy.config.environment_names.index("table.x") + len(noisy.config.state_names)
+    assert covariance[table, table] == 0.0
 
 
 @pytest.mark.parametrize("values", [{"hand_noise": -0.01, "coordinates": "fused"}, {"hand_noise": 0.01}])

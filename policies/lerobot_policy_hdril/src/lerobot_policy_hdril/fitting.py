@@ -128,11 +128,11 @@ def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Te
             window.mask,
             policy.config.ridge,
             policy.config.robust,
-            _noise_covariance(policy, window, seen),
+            noise_covariance(policy, window, seen),
         )
 
 
-def _noise_covariance(policy: HDRILPolicy, window: Window, seen: Tensor) -> Tensor:
+def noise_covariance(policy: HDRILPolicy, window: Window, seen: Tensor) -> Tensor:
     """Second moments (D, D) of how far features (N, D) of windows are moved by noise of the hands."""
     total = seen.new_zeros(seen.shape[1], seen.shape[1])
     if policy.hand_noise is None or not len(seen):

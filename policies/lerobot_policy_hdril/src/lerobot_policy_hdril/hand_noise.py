@@ -40,7 +40,7 @@ class HandNoise(nn.Module):
     hands: Tensor  # (G, 7), columns of the state
     rest: Tensor  # columns of the hands that are no pose's
 
-    def forward(self, states: list[Tensor], std: Tensor, generator: torch.Generator | None = None) -> list[Tensor]:
+    def forward(self, states: list[Tensor], std: Tensor, generator: torch.Generator) -> list[Tensor]:
         """The states (B, S), all disturbed alike; ``std`` (S,) is their deviation over the demonstrations."""
 
         def normal(*size: int) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -228,7 +229,7 @@ class HDRILPolicy(PreTrainedPolicy):
             self._learn_from(self._demonstrations, rows)
         self._check_learned()
         window = self._demonstrations.window(rows, self.config.trained_replan_every, self.ahead)
-        dynamics_loss, divergence = self.dynamics_loss(window)
+        dynamics_loss, divergence = self.dynamics_loss(window, self._noise_of(rows))
         history = self._demonstrations.history(rows[: self.config.planner_batch_size])
         planner_loss, accuracy = self.planner_loss(history, window)
         loss = dynamics_loss + planner_loss
@@ -259,11 +260,20 @@ class HDRILPolicy(PreTrainedPolicy):
         if not self.config.primitive_lengths:
             raise RuntimeError("this policy has learned nothing yet: train it with lerobot-train")
 
-    def dynamics_loss(self, window: Window) -> tuple[Tensor, Tensor]:
-        """Mean squared error and mean divergence of the latent, nats."""
+    def _noise_of(self, rows: Tensor) -> torch.Generator | None:
+        """What draws the noise of the hands for a batch of these rows (B,); None where there is no noise.
+
+        Seeded by the batch: a resumed run brings the same batches, but its new loader has drawn from PyTorch's own generator.
+        """
+        if self.hand_noise is None or not self.training:
+            return None
+        return torch.Generator(rows.device).manual_seed(zlib.crc32(rows.cpu().numpy().tobytes()))
+
+    def dynamics_loss(self, window: Window, noise: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        """Mean squared error and mean divergence of the latent, nats; ``noise`` draws that of the hands, if there is any."""
         state, filtered = window.state, window.filtered
-        if self.training and self.hand_noise is not None:
-            state, filtered = self.hand_noise([state, filtered], self.state_std)
+        if self.hand_noise is not None and noise is not None:
+            state, filtered = self.hand_noise([state, filtered], self.state_std, noise)
         predicted, divergence = self.predict(state, filtered, window.primitive, window.elapsed)
         difference = predicted - self.target(window)
         if self.config.robust:  # as the linear maps' fit, it is not to follow what is far off
