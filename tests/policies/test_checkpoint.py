@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import make_policy
 from lerobot_policy_hdril import HDRILConfig, HDRILPolicy, fitting
 from lerobot_policy_hdril.overrides import CHANGEABLE, check_overrides
+from lerobot_policy_hdril.presets import PRESETS
 from safetensors.torch import load_file, save_file
 from torch.utils.data import DataLoader
 
@@ -148,6 +149,15 @@ def test_preset_contradicted_by_a_value_that_is_the_default() -> None:
     assert HDRILConfig(device="cpu", push_to_hub=False, preset="res", hidden_dim=128).hidden_dim == 128
 
 
+@pytest.mark.parametrize(
+    "free", [{"filter_frames": 4, "robust": True}, {"replan_every": 3}, {"hidden_dim": 64, "robust": True}]
+)
+def test_a_preset_leaves_open_what_makes_no_other_model(free: dict[str, Any]) -> None:
+    config = HDRILConfig(device="cpu", push_to_hub=False, preset="hdril", **free)
+    for name, value in (PRESETS["hdril"] | free).items():
+        assert getattr(config, name) == value
+
+
 def test_replanning_is_limited_to_what_was_trained(metadata, tmp_path: Path) -> None:
     build(metadata, replan_every=4).save_pretrained(tmp_path / "four")
     for fine in (0, 4, 8):
@@ -192,6 +202,30 @@ def test_weights_that_are_missing_unknown_or_of_another_shape(damaged: Path) -> 
     file.unlink()
     with pytest.raises(FileNotFoundError, match="has no weights"):
         load(damaged)
+
+
+@pytest.mark.parametrize(
+    ("preset", "later"),
+    [
+        ("hdril", ["termination", "filter_frames", "robust", "hand_noise", "coordinates", "replan_every"]),
+        ("hdril_reactive", ["hand_noise"]),
+    ],
+)
+def test_older_checkpoint_acts_as_it_did_whatever_the_defaults_are_now(
+    preset: str, later: list[str], metadata, tmp_path: Path
+) -> None:
+    """Its config lacks the options that came later."""
+    saved = build(metadata, preset=preset, hidden_dim=32, hand_noise=0.0).eval()
+    saved.save_pretrained(tmp_path)
+    values = json.loads((tmp_path / "config.json").read_text())
+    for name in later:
+        del values[name]
+    (tmp_path / "config.json").write_text(json.dumps(values))
+    older = load(tmp_path)
+    assert asdict(older.config) == asdict(HDRILConfig(**asdict(saved.config) | {"pretrained_path": None}))
+    first = observation(metadata, [0])
+    saved.reset()
+    assert torch.equal(older.select_action(first), saved.select_action(first))
 
 
 def test_older_checkpoint_loads_without_provenance(damaged: Path, checkpoint: Path, metadata) -> None:

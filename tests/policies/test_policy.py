@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import asdict
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -304,6 +305,12 @@ def test_preset_is_what_its_name_says(preset: str) -> None:
     assert config.skip == (preset.startswith(("res", "hdril", "linear")))
     assert (config.decoder == "linear") == preset.startswith("linear")
     assert (config.interaction == "none") == preset.startswith(("gru_gru", "res_", "res_multi")) or preset == "res"
+    assert (config.termination == "learned") == (config.coordinates == "fused") == preset.endswith("_reactive")
+
+
+def test_the_defaults_are_the_reactive_preset() -> None:
+    named = asdict(HDRILConfig(device="cpu", push_to_hub=False, preset="hdril_reactive"))
+    assert asdict(HDRILConfig(device="cpu", push_to_hub=False)) == named | {"preset": ""}
 
 
 def test_preset_that_is_unknown_or_contradicted() -> None:

@@ -237,15 +237,12 @@ def test_predictions_are_weighted_by_their_precision(dtype: torch.dtype) -> None
 
 
 def test_a_fused_policy_says_what_it_needs(metadata) -> None:
-    for values in (
-        {"replan_every": 0},
-        {"replan_every": 1, "rollout": "open_loop"},
-        {"replan_every": 1, "state_skip": False},
-    ):
+    for values in ({"replan_every": 0}, {"rollout": "open_loop"}, {"state_skip": False}):
         with pytest.raises(
-            ValueError, match=r"^policy\.coordinates=fused needs policy\.state_skip=true, policy\.rollout="
+            ValueError,
+            match=r"^policy\.coordinates=fused needs policy\.state_skip=true, policy\.rollout=.* policy\.preset=hdril is with",
         ):
-            HDRILConfig(device="cpu", push_to_hub=False, coordinates="fused", **values)
+            HDRILConfig(device="cpu", push_to_hub=False, **values)
     with pytest.raises(
         ValueError, match=r"^policy\.coordinates=fused needs poses of objects and poses in the actions; "
     ):
@@ -253,7 +250,7 @@ def test_a_fused_policy_says_what_it_needs(metadata) -> None:
     with pytest.raises(
         ValueError, match=r"^policy\.filter_frames is for policy\.state_skip=true; got 8 and state_skip=false$"
     ):
-        HDRILConfig(device="cpu", push_to_hub=False, filter_frames=8, state_skip=False)
+        HDRILConfig(device="cpu", push_to_hub=False, coordinates="absolute", state_skip=False)
 
 
 def test_a_fused_plan_is_as_long_as_it_acts(metadata) -> None:
@@ -265,13 +262,14 @@ def test_a_fused_plan_is_as_long_as_it_acts(metadata) -> None:
 
 
 def test_noise_moves_the_hands_alone_and_all_states_alike() -> None:
-    names = [f"{side}_{name}" for side in ("left", "right") for name in ["gripper.pos", *(f"ee.{a}" for a in POSE)]]
+    told = [f"{side}_{name}" for side in ("left", "right") for name in ["gripper.pos", *(f"ee.{a}" for a in POSE)]]
+    names = [*told, "left_elbow.angle"]  # no action tells it
     openings, places, turns = [0, 8], [1, 2, 3, 9, 10, 11], [[4, 5, 6, 7], [12, 13, 14, 15]]
     states = torch.rand(20_000, 23, generator=generator(5))
     for columns in turns:
         states[:, columns] = turned(20_000, 1.0, generator(6)).float()
     std = torch.linspace(0.1, 1.0, 23)
-    one, same = HandNoise(names, 0.01)([states, states], std, generator())
+    one, same = HandNoise(names, told, 0.01)([states, states], std, generator())
     assert torch.equal(one, same)
     assert torch.equal(one[:, 16:], states[:, 16:])
     moved = (one - states)[:, [*openings, *places]]
@@ -365,9 +363,11 @@ def test_the_fit_bears_the_noise_that_the_option_asks_for(metadata) -> None:
     assert covariance[table, table] == 0.0
 
 
-@pytest.mark.parametrize("values", [{"hand_noise": -0.01, "coordinates": "fused"}, {"hand_noise": 0.01}])
+@pytest.mark.parametrize("values", [{"hand_noise": -0.01}, {"hand_noise": 0.01, "coordinates": "absolute"}])
 def test_noise_is_for_maps_that_are_fused(values: dict[str, Any]) -> None:
     with pytest.raises(
         ValueError, match=r"^policy\.hand_noise must not be negative, and is for policy\.coordinates=fused"
     ):
-        HDRILConfig(device="cpu", push_to_hub=False, replan_every=1, **values)
+        HDRILConfig(device="cpu", push_to_hub=False, **values)
+    for coordinates in ("absolute", "relational"):
+        assert HDRILConfig(device="cpu", push_to_hub=False, coordinates=coordinates).hand_noise == 0.0

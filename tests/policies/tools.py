@@ -45,9 +45,11 @@ def read(root: Path) -> LeRobotDatasetMetadata:
 
 
 def build(metadata: LeRobotDatasetMetadata, learned: bool = True, **values: Any) -> HDRILPolicy:
-    """A small policy; ``learned`` shows it a frame of every episode, so that its statistics and linear maps are fitted."""
+    """A small policy, the preset ``hdril`` but for these values; ``learned`` shows it a frame of every episode, so that its
+    statistics and linear maps are fitted."""
     torch.manual_seed(0)
-    policy = make_policy(HDRILConfig(**SMALL | values), ds_meta=metadata)
+    plain = {} if "preset" in values else PRESETS["hdril"]
+    policy = make_policy(HDRILConfig(**plain | SMALL | values), ds_meta=metadata)
     assert isinstance(policy, HDRILPolicy)
     if learned:
         data = demonstrations(policy)

@@ -26,6 +26,19 @@ Experts = Literal["auto", "separate", "stacked"]
 Termination = Literal["length", "learned"]
 
 
+_FREE = ("hidden_dim", "filter_frames", "robust", "hand_noise", "replan_every")
+"""What of a preset's values may be given otherwise: they do not make the model another one."""
+_BEFORE = {
+    "filter_frames": 1,
+    "robust": False,
+    "hand_noise": 0.0,
+    "termination": "length",
+    "coordinates": "absolute",
+    "replan_every": 0,
+}
+"""Values of options whose default was another one, or which were not there, when a checkpoint without them was saved."""
+
+
 def _check_choice(name: str, value: str, choices: Any) -> None:
     if value not in get_args(choices):
         raise ValueError(f"policy.{name} must be one of {', '.join(get_args(choices))}; got {value!r}")
@@ -36,6 +49,9 @@ def _check_choice(name: str, value: str, choices: Any) -> None:
 class HDRILConfig(SingleFrameConfig):
     """HDR-IL: a planner over primitives, and a graph-recurrent dynamics model for each (paper, Sections 4.1 to 4.3).
 
+    The defaults are those of the preset ``hdril_reactive``, which decides at every frame. ``preset=hdril`` looks once a
+    primitive, as in the paper, and needs no poses.
+
     The paper's models are values: GRU-GRU is ``interaction=none skip=false per_primitive=false``; Res adds ``skip``;
     Int adds ``interaction=scalar``; the Multi models and HDR-IL add ``per_primitive``. ``preset`` names them.
     """
@@ -43,24 +59,25 @@ class HDRILConfig(SingleFrameConfig):
     # Variant.
     preset: str = ""
     """Name of a model in :data:`~lerobot_policy_hdril.presets.PRESETS`, which then decides the values of this group, and
-    ``hidden_dim``; ``hidden_dim`` and ``hand_noise`` may be given nevertheless. Empty to set them one by one. Once the policy
-    has learned it is a name only."""
+    ``hidden_dim``. ``hidden_dim``, ``filter_frames``, ``robust``, ``hand_noise`` and ``replan_every`` may be given nevertheless.
+    Empty to set them one by one. Once the policy has learned it is a name only."""
     interaction: Interaction = "object"
     """Graph attention: ``none``; ``scalar``, the paper's node per number of the state; ``object``, a node per object."""
     skip: bool = True
     """The objects' state skips the encoder and joins its last hidden state (the paper's Res)."""
     state_skip: bool = True
     """A linear map from the state to every step of the prediction, beside the network (ours)."""
-    filter_frames: int = 1
+    filter_frames: int = 8
     """The linear maps see the mean of the last so many states beside the present one: observations are noisy. 1: no mean."""
-    robust: bool = False
+    robust: bool = True
     """Leave out of the linear maps' fit what is far off it, and train the network with Huber's loss: in demonstrations of
     scenes where something goes wrong, some windows show how that was mended."""
-    hand_noise: float = 0.0
+    hand_noise: float = 0.002
     """Deviation, m, by which the measured hands are disturbed when the dynamics learn, so that they do not learn to follow
-    themselves; 0: not at all. Rotations are disturbed in proportion. What is no pose, such as an opening, is disturbed by half
-    its deviation whatever the value, see :class:`~lerobot_policy_hdril.hand_noise.HandNoise`. For ``coordinates=fused``."""
-    termination: Termination = "length"
+    themselves; 0: not at all. Rotations are disturbed in proportion. What actions have by the same name and is no pose, such as
+    an opening, is disturbed by half its deviation whatever the value, see
+    :class:`~lerobot_policy_hdril.hand_noise.HandNoise`. For ``coordinates=fused``; others have 0 unless it is given."""
+    termination: Termination = "learned"
     """When a primitive is over. ``length``: after its shortest recorded length, as soon as the planner prefers another.
     ``learned``: the planner decides at every frame whether it goes on or one begins, maybe the same again; for
     demonstrations in which primitives are broken off and repeated."""
@@ -68,7 +85,7 @@ class HDRILConfig(SingleFrameConfig):
     """One dynamics model per primitive (the paper's Multi), or one for all that is told the primitive."""
     decoder: Decoder = "gru"
     """``ode``: the paper's other decoder. ``linear``: no network, the linear maps predict alone; a baseline for the others."""
-    coordinates: Coordinates = "absolute"
+    coordinates: Coordinates = "fused"
     """Of the dynamics. ``relational``: hands and predictions in the frame of the first object, as it stands when a plan is
     made. ``fused``: the linear maps predict the next actions in the world's and every object's frame, and the predictions
     are fused by their precision; needs ``replan_every``, because it plans no further than it acts. The planner always sees
@@ -83,7 +100,7 @@ class HDRILConfig(SingleFrameConfig):
     # Rollout.
     rollout: Rollout = "closed_loop"
     """``closed_loop`` makes each plan from what is seen; ``open_loop`` chains predictions from the first state (the paper)."""
-    replan_every: int = 0
+    replan_every: int = 1
     """Make a new plan every so many frames within a primitive as well; 0: at its start alone. A policy that was trained
     with n can be run with 0 and with any multiple of n."""
 
@@ -157,6 +174,8 @@ class HDRILConfig(SingleFrameConfig):
         self._complete_older_checkpoint()
         if self.preset and not self.primitives:
             self._apply_preset()
+        if self.coordinates != "fused" and "hand_noise" not in self._given:
+            self.hand_noise = 0.0
         _check_choice("interaction", self.interaction, Interaction)
         _check_choice("decoder", self.decoder, Decoder)
         _check_choice("rollout", self.rollout, Rollout)
@@ -182,16 +201,16 @@ class HDRILConfig(SingleFrameConfig):
                 "policy.decoder=linear needs policy.state_skip=true, policy.per_primitive=true and "
                 f"policy.latent=deterministic; got {self.state_skip}, {self.per_primitive} and {self.latent}"
             )
-        if self.filter_frames > 1 and not self.state_skip:
-            raise ValueError(
-                f"policy.filter_frames is for policy.state_skip=true; got {self.filter_frames} and state_skip=false"
-            )
         if self.coordinates == "fused" and not (
             self.state_skip and self.rollout == "closed_loop" and self.replan_every
         ):
             raise ValueError(
                 "policy.coordinates=fused needs policy.state_skip=true, policy.rollout=closed_loop and policy.replan_every "
-                f"of at least 1; got {self.state_skip}, {self.rollout} and {self.replan_every}"
+                f"of at least 1; got {self.state_skip}, {self.rollout} and {self.replan_every}. policy.preset=hdril is without it"
+            )
+        if self.filter_frames > 1 and not self.state_skip:
+            raise ValueError(
+                f"policy.filter_frames is for policy.state_skip=true; got {self.filter_frames} and state_skip=false"
             )
         if self.hand_noise < 0 or (self.hand_noise and self.coordinates != "fused"):
             raise ValueError(
@@ -202,7 +221,12 @@ class HDRILConfig(SingleFrameConfig):
             raise ValueError(f"policy.replan_every must be 0 (never) or more frames, got {self.replan_every}")
 
     def _complete_older_checkpoint(self) -> None:
-        """Checkpoints from before ``training_data`` have what they learned from in no record."""
+        """Checkpoints from before an option was there act as they did. Those from before ``training_data`` have what they learned
+        from in no record."""
+        if self.primitives:
+            for name, value in _BEFORE.items():
+                if name not in self._given:
+                    setattr(self, name, value)
         if self.primitive_lengths and not self.capacity:
             self.capacity = max(longest for _, longest in self.primitive_lengths)
         if self.primitive_lengths and not self.training_data:
@@ -215,7 +239,7 @@ class HDRILConfig(SingleFrameConfig):
             given = getattr(self, name)
             if name not in self._given:
                 setattr(self, name, value)
-            elif given != value and name not in ("hidden_dim", "hand_noise"):
+            elif given != value and name not in _FREE:
                 raise ValueError(
                     f"policy.preset={self.preset} makes policy.{name} {value!r}, but {given!r} was given; leave out one"
                 )

@@ -39,7 +39,7 @@ class ObjectFrames(nn.Module):
         if not frames or not hands:
             raise ValueError(
                 "policy.coordinates=fused needs poses of objects and poses in the actions; "
-                f"objects: {', '.join(objects)}; actions: {', '.join(action_names)}"
+                f"objects: {', '.join(objects)}; actions: {', '.join(action_names)}. policy.preset=hdril needs none"
             )
         others = [[place for place, group in enumerate(poses) if group != frame] for frame in frames]
         rest = [i for i in range(len(action_names)) if not any(i in hand for hand in hands)]

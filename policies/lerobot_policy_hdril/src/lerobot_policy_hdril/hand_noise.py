@@ -18,27 +18,29 @@ ANGLE = 5.0
 """Deviation of the rotation about each axis, in rad for each metre of that of the position: a point 20 cm from the wrist moves as
 far by the one as by the other."""
 REST = 0.5
-"""Noise of what is no pose, such as an opening, in units of its deviation over the demonstrations."""
+"""Noise of what is told and is no pose, such as an opening, in units of its deviation over the demonstrations."""
 
 
 class HandNoise(nn.Module):
-    """Disturbs the hands in states.
+    """Disturbs the hands in states: their poses, and what an action has by the same name, such as an opening.
 
     Args:
         state_names: names of the numbers of ``observation.state``, which come first in a state.
+        action_names: names of an action's numbers.
         deviation: standard deviation of a hand's position along each axis, m.
     """
 
-    def __init__(self, state_names: list[str], deviation: float) -> None:
+    def __init__(self, state_names: list[str], action_names: list[str], deviation: float) -> None:
         super().__init__()
         hands = pose_groups(state_names)
-        rest = [i for i in range(len(state_names)) if not any(i in hand for hand in hands)]
+        told = [i for i, name in enumerate(state_names) if name in action_names]
+        rest = [i for i in told if not any(i in hand for hand in hands)]
         self.register_buffer("hands", torch.tensor(hands, dtype=torch.long).reshape(-1, 7), persistent=False)
         self.register_buffer("rest", torch.tensor(rest, dtype=torch.long), persistent=False)
         self.deviation = deviation
 
     hands: Tensor  # (G, 7), columns of the state
-    rest: Tensor  # columns of the hands that are no pose's
+    rest: Tensor  # columns of the state that actions have too, and that are no pose's
 
     def forward(self, states: list[Tensor], std: Tensor, generator: torch.Generator) -> list[Tensor]:
         """The states (B, S), all disturbed alike; ``std`` (S,) is their deviation over the demonstrations."""

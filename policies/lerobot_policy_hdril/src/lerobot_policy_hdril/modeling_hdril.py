@@ -134,7 +134,9 @@ class HDRILPolicy(PreTrainedPolicy):
         self.relational = None
         if config.coordinates == "relational":
             self.relational = RelationalCoordinates(names, config.environment_names, [*config.action_names, *names])
-        self.hand_noise = HandNoise(config.state_names, config.hand_noise) if config.hand_noise else None
+        self.hand_noise = None
+        if config.hand_noise:
+            self.hand_noise = HandNoise(config.state_names, config.action_names, config.hand_noise)
         self.frames = self.fused = None
         if fused:
             frames = self.frames = ObjectFrames(names, config.environment_names, config.action_names)
