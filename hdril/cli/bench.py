@@ -157,8 +157,9 @@ def bench_training(task: str, root: Path, steps: int, output: Path) -> Figure:
     return Figure("loader, share of a training step", 100.0 * data / (update + data), 30.0, False, "%")
 
 
-def bench_action(root: Path, task: str) -> Figure:
-    """One ``select_action`` on one core, averaged over an episode."""
+def bench_action(root: Path, task: str) -> list[Figure]:
+    """One ``select_action`` on one core, of the policy that decides at every frame, averaged over an episode and the slowest of
+    one."""
     import torch
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.policies.factory import make_policy
@@ -172,15 +173,19 @@ def bench_action(root: Path, task: str) -> Figure:
     policy.eval()
     horizon = get_task(task).horizon
 
-    def episode() -> None:
+    def episode() -> list[float]:
         policy.reset()
-        for _ in range(horizon):
-            policy.select_action(batch)
+        return [_seconds(lambda: policy.select_action(batch)) for _ in range(horizon)]
 
     with torch.inference_mode():  # as LeRobot calls it
         episode()
-        best = min(_seconds(episode) for _ in range(5))
-    return Figure("one action, amortised over an episode", 1e3 * best / horizon, 2.0, False, "ms")
+        played = [episode() for _ in range(5)]
+    # What else runs on the machine makes single actions slow: the best of five episodes is the policy's own.
+    mean, slowest = min(sum(seconds) for seconds in played) / horizon, min(max(seconds) for seconds in played)
+    return [
+        Figure("one action, amortised over an episode", 1e3 * mean, 2.0, False, "ms"),
+        Figure("the slowest action of an episode", 1e3 * slowest, 10.0, False, "ms"),
+    ]
 
 
 def _samples_per_second(policy, batch: dict, steps: int, mixed: bool = False) -> float:
@@ -275,7 +280,8 @@ def bench_command(config: BenchConfig) -> None:
             print(figure, flush=True)
         print(bench_scenes(config.task, config.episodes), flush=True)
         print(bench_training(config.task, root, config.train_steps, Path(folder) / "train"), flush=True)
-        print(bench_action(root, config.task), flush=True)
+        for figure in bench_action(root, config.task):
+            print(figure, flush=True)
         print(bench_rerun(config.task, Path(folder) / "rerun"), flush=True)
         for figure in bench_policies(root):
             print(figure, flush=True)

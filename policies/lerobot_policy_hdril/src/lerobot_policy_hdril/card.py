@@ -26,8 +26,8 @@ CITATION = """@inproceedings{xie2020deep,
   booktitle = {Advances in Neural Information Processing Systems},
   year = {2020}
 }"""
-_CHOICES = ("preset", "interaction", "skip", "state_skip", "per_primitive", "decoder", "coordinates", "latent", "rollout",
-            "replan_every", "hidden_dim")  # fmt: skip
+_CHOICES = ("preset", "interaction", "skip", "state_skip", "per_primitive", "decoder", "coordinates", "latent", "termination",
+            "filter_frames", "robust", "hand_noise", "rollout", "replan_every", "hidden_dim")  # fmt: skip
 
 
 def simulated_task(config: HDRILConfig, dataset_meta: LeRobotDatasetMetadata | None) -> str | None:
