@@ -1,4 +1,4 @@
-"""A copy of a checkpoint with the model of one primitive damaged: all its weights are zero.
+"""A copy of a checkpoint with the model of one primitive damaged: all its weights are zero, and its linear maps.
 
 python scripts/damage.py outputs/demo/train/checkpoints/last/pretrained_model outputs/damaged lift
 
@@ -34,7 +34,9 @@ def damage(checkpoint: Path, output: Path, primitive: str) -> None:
     weights = load_file(checkpoint / "model.safetensors")
     mine = tuple(f"{part}.{own.index(primitive)}." for part in ("dynamics", "fused"))
     for name, value in weights.items():
-        if name.startswith(mine):
+        if name.startswith(mine) and not name.endswith(
+            (".precision", ".variance")
+        ):  # those of nothing could not be fused
             value.zero_()
     shutil.copytree(checkpoint, output)
     save_file(weights, output / "model.safetensors")

@@ -127,9 +127,11 @@ class EpisodeLog:
             for name in attention[0]:
                 self._curve(f"attention/{name}", np.array([shares[name] for shares in attention]), at)
         for frame, explanation in explanations.items():
-            if explanation.plan is None or len(explanation.plan) < 2:
+            if explanation.plan is None:
                 continue
             poses = hand_poses(explanation.plan)
+            if len(poses) == 1:  # a plan of one action leads from where the hands are
+                poses = np.concatenate([hand_poses(self._trace.state[frame : frame + 1]), poses])
             fading = np.linspace(255, 50, len(poses) - 1).astype(int)
             for i, side in enumerate(SIDES):
                 path = poses[:, i, :3]

@@ -56,7 +56,7 @@ def save_hdril(folder: Path, dataset: Path, episodes: tuple[int, ...] = (0, 1, 2
     """HDR-IL that saw one frame of each of these episodes: what is solved is solved, and nothing else is trained."""
     metadata = LeRobotDatasetMetadata("hdril/test", root=dataset)
     torch.manual_seed(0)
-    policy = make_policy(HDRILConfig(device="cpu", push_to_hub=False), ds_meta=metadata)
+    policy = make_policy(HDRILConfig(device="cpu", push_to_hub=False, preset="hdril"), ds_meta=metadata)
     starts = metadata.episodes["dataset_from_index"]
     policy.train()
     policy.forward({"index": torch.tensor([starts[episode] for episode in episodes])})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import asdict, fields
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -226,6 +227,24 @@ def test_older_checkpoint_acts_as_it_did_whatever_the_defaults_are_now(
     first = observation(metadata, [0])
     saved.reset()
     assert torch.equal(older.select_action(first), saved.select_action(first))
+
+
+@pytest.mark.parametrize("preset", ["hdril", "hdril_reactive"])
+def test_a_checkpoint_that_is_damaged_on_purpose_acts_otherwise_in_one_primitive(
+    preset: str, metadata, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``scripts/damage.py``."""
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "scripts")
+    damage = import_module("damage").damage
+    build(metadata, preset=preset).save_pretrained(tmp_path / "whole")
+    damage(tmp_path / "whole", tmp_path / "damaged", "move")
+    whole, damaged = (load(tmp_path / name) for name in ("whole", "damaged"))
+    seen = observation(metadata, [15])
+    state = torch.cat([seen["observation.state"], seen["observation.environment_state"]], dim=-1)
+    for primitive, name in enumerate(whole.config.primitives):
+        plans = [policy.plan(state, state, torch.tensor([primitive]), torch.tensor([0])) for policy in (whole, damaged)]
+        assert torch.equal(*plans) == (name != "move")
+        assert plans[1].isfinite().all()
 
 
 def test_older_checkpoint_loads_without_provenance(damaged: Path, checkpoint: Path, metadata) -> None:

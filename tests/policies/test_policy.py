@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import json
+import pickle
 import subprocess
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, fields, replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
@@ -18,6 +20,7 @@ import torch
 from lerobot.policies.factory import make_policy
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from lerobot_policy_hdril import HDRILConfig, HDRILPolicy, companions
+from lerobot_policy_hdril.card import model_card
 from lerobot_policy_hdril.demonstrations import Demonstrations
 from lerobot_policy_hdril.presets import PRESETS
 
@@ -135,7 +138,7 @@ def test_plan_undoes_what_the_target_did(coordinates: str, metadata, monkeypatch
     torch.testing.assert_close(plan[window.mask], window.target[window.mask], atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize("preset", ["hdril", "hdril_paper", "res_multi_relational"])
+@pytest.mark.parametrize("preset", ["hdril", "hdril_paper", "res_multi_relational", "hdril_reactive"])
 def test_stacked_models_are_the_separate_ones(preset: str, metadata) -> None:
     """Same predictions with several primitives in the batch, same loss gradients, at the start and within primitives."""
     values = {"preset": preset, "replan_every": 4}
@@ -148,7 +151,7 @@ def test_stacked_models_are_the_separate_ones(preset: str, metadata) -> None:
     rows = torch.tensor([0, 3, 25, 15, 69, 70, 101, 140, 30, 31])
     gradients = []
     for policy in (separate.eval(), stacked.eval()):
-        window = demonstrations(policy).window(rows, 4, 12)
+        window = demonstrations(policy).window(rows, 4, policy.ahead)
         predicted = policy.predict(window.state, window.filtered, window.primitive, window.elapsed)
         policy.dynamics_loss(window)[0].backward()
         gradients.append([*predicted, *(p.grad for p in policy.dynamics.parameters() if p.grad is not None)])
@@ -308,9 +311,40 @@ def test_preset_is_what_its_name_says(preset: str) -> None:
     assert (config.termination == "learned") == (config.coordinates == "fused") == preset.endswith("_reactive")
 
 
+def by_position(config: HDRILConfig) -> HDRILConfig:
+    return HDRILConfig(*(getattr(config, entry.name) for entry in fields(config) if not entry.kw_only))
+
+
+def by_pickle(config: HDRILConfig) -> HDRILConfig:
+    return pickle.loads(pickle.dumps(config))
+
+
+@pytest.mark.parametrize("again", [copy.deepcopy, replace, by_pickle, by_position])
+def test_a_copy_of_a_trained_config_is_the_same(again, metadata) -> None:
+    config = build(metadata, preset="hdril_reactive").config
+    assert asdict(again(config)) == asdict(config)
+
+
 def test_the_defaults_are_the_reactive_preset() -> None:
     named = asdict(HDRILConfig(device="cpu", push_to_hub=False, preset="hdril_reactive"))
     assert asdict(HDRILConfig(device="cpu", push_to_hub=False)) == named | {"preset": ""}
+
+
+@pytest.mark.parametrize(
+    ("values", "looks"),
+    [
+        ({"preset": "hdril"}, "looks again when the primitive is over."),
+        ({"preset": "hdril", "replan_every": 4}, "looks again every 4 frames."),
+        ({"preset": "hdril", "rollout": "open_loop"}, "looks again at nothing but its own predictions."),
+        ({"preset": "hdril_reactive"}, "looks again at every frame."),
+    ],
+)
+def test_a_card_says_when_the_policy_looks(values, looks: str, metadata) -> None:
+    policy = build(metadata, **values)
+    text = str(model_card(policy.config, "user/set", None, None, None, metadata))
+    assert looks in text
+    for name in ("termination", "filter_frames", "robust", "hand_noise"):
+        assert f"`{getattr(policy.config, name)}`" in text.partition(f"| `{name}`")[2].partition("\n")[0]
 
 
 def test_preset_that_is_unknown_or_contradicted() -> None:

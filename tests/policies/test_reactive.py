@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from lerobot_policy_hdril import HDRILConfig
+from draccus.utils import ParsingError
+from lerobot_policy_hdril import HDRILConfig, HDRILPolicy
 from lerobot_policy_hdril.coordinates import conjugate, multiply, rotate
 from lerobot_policy_hdril.dynamics import StateSkip, ridge_penalty, solve_ridge, usual_windows
 from lerobot_policy_hdril.fitting import noise_covariance
 from lerobot_policy_hdril.fusion import FusedMaps, ObjectFrames
 from lerobot_policy_hdril.hand_noise import ANGLE, REST, HandNoise
 from lerobot_policy_hdril.player import Choice
+from lerobot_policy_hdril.presets import PRESETS
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -240,22 +244,34 @@ def test_a_fused_policy_says_what_it_needs(metadata) -> None:
     for values in ({"replan_every": 0}, {"rollout": "open_loop"}, {"state_skip": False}):
         with pytest.raises(
             ValueError,
-            match=r"^policy\.coordinates=fused needs policy\.state_skip=true, policy\.rollout=.* policy\.preset=hdril is with",
+            match=r"^policy\.coordinates=fused needs policy\.state_skip=true, .*; or give policy\.coordinates=absolute$",
         ):
             HDRILConfig(device="cpu", push_to_hub=False, **values)
     with pytest.raises(
-        ValueError, match=r"^policy\.coordinates=fused needs poses of objects and poses in the actions; "
+        ValueError, match=r"^policy\.coordinates=fused needs poses of objects and .* policy\.preset=hdril needs none$"
     ):
         ObjectFrames(STATE, [], ACTION)
     with pytest.raises(
         ValueError, match=r"^policy\.filter_frames is for policy\.state_skip=true; got 8 and state_skip=false$"
     ):
-        HDRILConfig(device="cpu", push_to_hub=False, coordinates="absolute", state_skip=False)
+        HDRILConfig(device="cpu", push_to_hub=False, coordinates="absolute", state_skip=False, filter_frames=8)
+    assert HDRILConfig(device="cpu", push_to_hub=False, coordinates="absolute", state_skip=False).filter_frames == 1
+    with pytest.raises(
+        ValueError, match=r"^policy\.decoder=ode is integrated over a plan, and policy\.coordinates=fused "
+    ):
+        HDRILConfig(device="cpu", push_to_hub=False, decoder="ode")
 
 
 def test_a_fused_plan_is_as_long_as_it_acts(metadata) -> None:
     policy = build(metadata, coordinates="fused", replan_every=2).eval()
-    assert policy.predict_action_chunk(observation(metadata, [0, FRAMES])).shape == (2, 2, 16)
+    seen = observation(metadata, [0, FRAMES])
+    with pytest.raises(
+        RuntimeError, match=r"^with policy\.coordinates=fused, predict_action_chunk .* policy\.preset=hdril$"
+    ):
+        policy.predict_action_chunk(seen)
+    for left in (1, 2, 1):
+        policy.select_action(seen)
+        assert policy.predict_action_chunk(seen).shape == (2, left, 16)
 
 
 # ---------------------------------------------------------------------- noise of the hands
@@ -340,6 +356,40 @@ def test_noise_disturbs_training_alone(metadata) -> None:
     assert noisy == again != without
     assert len(set(losses(training=False))) == 1
     assert torch.equal(torch.get_rng_state(), before)
+
+
+@pytest.mark.parametrize(
+    "values", [{"per_primitive": False}, {"latent": "variational", "samples": 2}, {"interaction": "scalar"}]
+)
+def test_the_defaults_with_another_value_learn_and_act(values: dict[str, Any], metadata, tmp_path: Path) -> None:
+    policy = build(metadata, **PRESETS["hdril_reactive"] | values)
+    policy.train().forward({"index": BATCH})[0].backward()
+    policy.eval().save_pretrained(tmp_path)
+    loaded = HDRILPolicy.from_pretrained(tmp_path)
+    for frame in range(3):
+        seen = observation(metadata, [frame])
+        assert torch.equal(loaded.select_action(seen), policy.select_action(seen))
+
+
+@pytest.mark.parametrize("override", ["--rollout=open_loop", "--replan_every=0", "--replan_every=2"])
+def test_a_trained_fused_policy_looks_as_it_learned(override: str, metadata, tmp_path: Path) -> None:
+    build(metadata, preset="hdril_reactive").save_pretrained(tmp_path)
+    with pytest.raises((ValueError, ParsingError)) as raised:
+        HDRILPolicy.from_pretrained(tmp_path, config=HDRILConfig.from_pretrained(tmp_path, cli_overrides=[override]))
+    told = str(raised.value.__cause__ or raised.value)  # draccus wraps what a config says of itself
+    assert re.match(r"policy\.(coordinates=fused needs .*; train with|replan_every must be 1, because)", told), told
+
+
+def test_noise_spares_what_no_action_tells(tmp_path: Path, metadata) -> None:
+    """A policy gives the noise the names of both."""
+    policy = build(metadata, preset="hdril_reactive")
+    assert policy.hand_noise is not None
+    states, actions = policy.config.state_names, policy.config.action_names
+    assert [states[i] for i in policy.hand_noise.rest] == ["left_gripper.pos", "right_gripper.pos"]
+    policy.config.action_names = [name for name in actions if name != "left_gripper.pos"]
+    policy._build()
+    assert policy.hand_noise is not None
+    assert [states[i] for i in policy.hand_noise.rest] == ["right_gripper.pos"]
 
 
 def test_the_fit_bears_the_noise_that_the_option_asks_for(metadata) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args
 
 from lerobot.configs.policies import PreTrainedConfig
@@ -26,8 +26,8 @@ Experts = Literal["auto", "separate", "stacked"]
 Termination = Literal["length", "learned"]
 
 
-_FREE = ("hidden_dim", "filter_frames", "robust", "hand_noise", "replan_every")
-"""What of a preset's values may be given otherwise: they do not make the model another one."""
+_FREE = ("hidden_dim", "termination", "filter_frames", "robust", "hand_noise", "replan_every")
+"""Options that may differ from the preset's value."""
 _BEFORE = {
     "filter_frames": 1,
     "robust": False,
@@ -50,17 +50,18 @@ class HDRILConfig(SingleFrameConfig):
     """HDR-IL: a planner over primitives, and a graph-recurrent dynamics model for each (paper, Sections 4.1 to 4.3).
 
     The defaults are those of the preset ``hdril_reactive``, which decides at every frame. ``preset=hdril`` looks once a
-    primitive, as in the paper, and needs no poses.
+    primitive, and needs no poses.
 
-    The paper's models are values: GRU-GRU is ``interaction=none skip=false per_primitive=false``; Res adds ``skip``;
-    Int adds ``interaction=scalar``; the Multi models and HDR-IL add ``per_primitive``. ``preset`` names them.
+    The paper's models are presets. GRU-GRU has ``interaction=none skip=false per_primitive=false``; Res adds ``skip``;
+    Int adds ``interaction=scalar``; the Multi models and HDR-IL add ``per_primitive``.
     """
 
     # Variant.
     preset: str = ""
     """Name of a model in :data:`~lerobot_policy_hdril.presets.PRESETS`, which then decides the values of this group, and
-    ``hidden_dim``. ``hidden_dim``, ``filter_frames``, ``robust``, ``hand_noise`` and ``replan_every`` may be given nevertheless.
-    Empty to set them one by one. Once the policy has learned it is a name only."""
+    ``hidden_dim``. ``hidden_dim``, ``termination``, ``filter_frames``, ``robust``, ``hand_noise`` and ``replan_every`` may be
+    given nevertheless, where the model has a use for them. Empty to set them one by one. Once the policy has learned it is a
+    name only."""
     interaction: Interaction = "object"
     """Graph attention: ``none``; ``scalar``, the paper's node per number of the state; ``object``, a node per object."""
     skip: bool = True
@@ -68,21 +69,23 @@ class HDRILConfig(SingleFrameConfig):
     state_skip: bool = True
     """A linear map from the state to every step of the prediction, beside the network (ours)."""
     filter_frames: int = 8
-    """The linear maps see the mean of the last so many states beside the present one: observations are noisy. 1: no mean."""
+    """The linear maps see the mean of the last so many states beside the present one: observations are noisy. 1: no mean. It
+    is 1 without ``state_skip``, which has the maps."""
     robust: bool = True
     """Leave out of the linear maps' fit what is far off it, and train the network with Huber's loss: in demonstrations of
     scenes where something goes wrong, some windows show how that was mended."""
     hand_noise: float = 0.002
     """Deviation, m, by which the measured hands are disturbed when the dynamics learn, so that they do not learn to follow
-    themselves; 0: not at all. Rotations are disturbed in proportion. What actions have by the same name and is no pose, such as
-    an opening, is disturbed by half its deviation whatever the value, see
-    :class:`~lerobot_policy_hdril.hand_noise.HandNoise`. For ``coordinates=fused``; others have 0 unless it is given."""
+    themselves; 0: not at all. Rotations are disturbed in proportion. Numbers that actions have by the same name and that
+    are no pose, such as an opening, are disturbed by half their deviation whatever the value, see
+    :class:`~lerobot_policy_hdril.hand_noise.HandNoise`. For ``coordinates=fused`` alone; it is 0 with others."""
     termination: Termination = "learned"
     """When a primitive is over. ``length``: after its shortest recorded length, as soon as the planner prefers another.
     ``learned``: the planner decides at every frame whether it goes on or one begins, maybe the same again; for
     demonstrations in which primitives are broken off and repeated."""
     per_primitive: bool = True
-    """One dynamics model per primitive (the paper's Multi), or one for all that is told the primitive."""
+    """One dynamics model per primitive (the paper's Multi), or one for all that is told the primitive. Fused linear maps are one
+    for each in any case."""
     decoder: Decoder = "gru"
     """``ode``: the paper's other decoder. ``linear``: no network, the linear maps predict alone; a baseline for the others."""
     coordinates: Coordinates = "fused"
@@ -102,7 +105,7 @@ class HDRILConfig(SingleFrameConfig):
     """``closed_loop`` makes each plan from what is seen; ``open_loop`` chains predictions from the first state (the paper)."""
     replan_every: int = 1
     """Make a new plan every so many frames within a primitive as well; 0: at its start alone. A policy that was trained
-    with n can be run with 0 and with any multiple of n."""
+    with n can be run with 0 and with any multiple of n, unless its predictions are fused."""
 
     # Sizes.
     hidden_dim: int = 128
@@ -166,7 +169,8 @@ class HDRILConfig(SingleFrameConfig):
     def __new__(cls, *args: Any, **kwargs: Any) -> HDRILConfig:
         """Note which values were given: one that equals the default must count against a preset, too."""
         config = super().__new__(cls)
-        config._given = frozenset(kwargs)
+        named = [entry.name for entry in fields(cls) if entry.init and not entry.kw_only]
+        config._given = frozenset(kwargs) | frozenset(named[: len(args)])
         return config
 
     def __post_init__(self) -> None:
@@ -176,6 +180,8 @@ class HDRILConfig(SingleFrameConfig):
             self._apply_preset()
         if self.coordinates != "fused" and "hand_noise" not in self._given:
             self.hand_noise = 0.0
+        if not self.state_skip and self.coordinates != "fused" and "filter_frames" not in self._given:
+            self.filter_frames = 1
         _check_choice("interaction", self.interaction, Interaction)
         _check_choice("decoder", self.decoder, Decoder)
         _check_choice("rollout", self.rollout, Rollout)
@@ -201,13 +207,8 @@ class HDRILConfig(SingleFrameConfig):
                 "policy.decoder=linear needs policy.state_skip=true, policy.per_primitive=true and "
                 f"policy.latent=deterministic; got {self.state_skip}, {self.per_primitive} and {self.latent}"
             )
-        if self.coordinates == "fused" and not (
-            self.state_skip and self.rollout == "closed_loop" and self.replan_every
-        ):
-            raise ValueError(
-                "policy.coordinates=fused needs policy.state_skip=true, policy.rollout=closed_loop and policy.replan_every "
-                f"of at least 1; got {self.state_skip}, {self.rollout} and {self.replan_every}. policy.preset=hdril is without it"
-            )
+        if self.coordinates == "fused":
+            self._check_fused()
         if self.filter_frames > 1 and not self.state_skip:
             raise ValueError(
                 f"policy.filter_frames is for policy.state_skip=true; got {self.filter_frames} and state_skip=false"
@@ -219,6 +220,23 @@ class HDRILConfig(SingleFrameConfig):
             )
         if self.replan_every < 0:
             raise ValueError(f"policy.replan_every must be 0 (never) or more frames, got {self.replan_every}")
+
+    def _check_fused(self) -> None:
+        remedy = (
+            "train with policy.preset=hdril for another way"
+            if self.primitives
+            else "or give policy.coordinates=absolute"
+        )
+        if not (self.state_skip and self.rollout == "closed_loop" and self.replan_every):
+            raise ValueError(
+                "policy.coordinates=fused needs policy.state_skip=true, policy.rollout=closed_loop and policy.replan_every "
+                f"of at least 1; got {self.state_skip}, {self.rollout} and {self.replan_every}; {remedy}"
+            )
+        if self.decoder == "ode":
+            raise ValueError(
+                "policy.decoder=ode is integrated over a plan, and policy.coordinates=fused plans no further than it acts; "
+                "give policy.coordinates=absolute"
+            )
 
     def _complete_older_checkpoint(self) -> None:
         """Checkpoints from before an option was there act as they did. Those from before ``training_data`` have what they learned

@@ -55,7 +55,8 @@ class HDRILPolicy(PreTrainedPolicy):
 
     A state s (S,) is ``observation.state`` and ``observation.environment_state`` side by side. At every frame the
     planner turns s_0 … s_t into a distribution over primitives. When a primitive is over, the most probable one is next,
-    and its dynamics model predicts the actions that remain of it, see :func:`~lerobot_policy_hdril.player.advance`.
+    and its dynamics model predicts the actions that remain of it, see :func:`~lerobot_policy_hdril.player.advance`. With
+    ``replan_every=1``, as by default, it predicts anew at every frame.
 
     Args:
         config: see :class:`HDRILConfig`.
@@ -423,7 +424,18 @@ class HDRILPolicy(PreTrainedPolicy):
 
         N is what remains of the longest form of the primitive; where the rows of a batch differ, shorter ones repeat their
         last action.
+
+        With ``coordinates=fused`` N is ``replan_every`` at most, and an episode must run: such a plan ends before the primitive
+        does, and alone could only ever begin it.
+
+        Raises:
+            RuntimeError: no episode runs, and ``coordinates=fused``.
         """
+        if self.fused is not None and self._playback is None:
+            raise RuntimeError(
+                "with policy.coordinates=fused, predict_action_chunk tells the next actions of an episode that select_action "
+                "plays, and none runs; for chunks alone, as LeRobot's asynchronous server wants them, train policy.preset=hdril"
+            )
         rest = self._next(batch).rest(self.longest_length)
         return rest[..., : len(self.config.action_names)]
 
