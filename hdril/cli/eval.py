@@ -34,7 +34,7 @@ from hdril.viewer.keep import check_keep
 
 @dataclass
 class PolicySource:
-    """Which policy. Any other --policy.NAME=VALUE changes its config for this evaluation, e.g. --policy.rollout=open_loop;
+    """Which policy. Any other --policy.NAME=VALUE changes its config for this evaluation, e.g. --policy.samples=5;
     an option that the policy does not have, or that its weights have fixed, is refused."""
 
     path: str

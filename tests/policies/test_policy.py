@@ -333,10 +333,10 @@ def test_the_defaults_are_the_reactive_preset() -> None:
 @pytest.mark.parametrize(
     ("values", "looks"),
     [
-        ({"preset": "hdril"}, "looks again when the primitive is over."),
-        ({"preset": "hdril", "replan_every": 4}, "looks again every 4 frames."),
-        ({"preset": "hdril", "rollout": "open_loop"}, "looks again at nothing but its own predictions."),
-        ({"preset": "hdril_reactive"}, "looks again at every frame."),
+        ({"preset": "hdril"}, "the policy looks again when the primitive is over."),
+        ({"preset": "hdril", "replan_every": 4}, "the policy looks every 4 frames."),
+        ({"preset": "hdril", "rollout": "open_loop"}, "from its own predictions, without looking again."),
+        ({"preset": "hdril_reactive"}, "the policy looks at every frame."),
     ],
 )
 def test_a_card_says_when_the_policy_looks(values, looks: str, metadata) -> None:

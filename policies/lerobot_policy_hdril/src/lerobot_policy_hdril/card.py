@@ -44,8 +44,8 @@ def simulated_task(config: HDRILConfig, dataset_meta: LeRobotDatasetMetadata | N
 def _looks(config: HDRILConfig) -> str:
     every = config.replan_every
     if config.rollout == "open_loop":
-        return "at nothing but its own predictions"
-    return {0: "when the primitive is over", 1: "at every frame"}.get(every, f"every {every} frames")
+        return "goes on from its own predictions, without looking again"
+    return {0: "looks again when the primitive is over", 1: "looks at every frame"}.get(every, f"looks every {every} frames")
 
 
 def model_card(
@@ -74,7 +74,7 @@ def model_card(
 
 Hierarchical deep relational imitation learning ([Xie et al., NeurIPS 2020](https://arxiv.org/abs/2010.05134)) as a
 LeRobot policy: a planner picks the next primitive, one graph-recurrent dynamics model per primitive predicts its
-trajectory, and the policy looks again {_looks(config)}.
+trajectory, and the policy {_looks(config)}.
 
 Weights are safetensors; the policy's code comes with the Python package `lerobot_policy_hdril`, and no remote code is run.
 

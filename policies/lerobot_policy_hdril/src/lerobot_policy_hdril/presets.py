@@ -14,7 +14,7 @@ _FEATURES: dict[str, dict[str, Any]] = {
 }
 # A model for all primitives is wider, to have about as many parameters as six small ones together (paper, appendix A.1).
 _SINGLE_HIDDEN, _MULTI_HIDDEN = {"none": 322, "scalar": 410}, 128
-# It looks once a primitive, as in the paper, and learns from what it is shown.
+# The paper's models look once a primitive, or never, and learn from all that they are shown.
 _PLAIN = {"termination": "length", "filter_frames": 1, "robust": False, "hand_noise": 0.0, "replan_every": 0}
 
 
