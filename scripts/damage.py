@@ -34,9 +34,8 @@ def damage(checkpoint: Path, output: Path, primitive: str) -> None:
     weights = load_file(checkpoint / "model.safetensors")
     mine = tuple(f"{part}.{own.index(primitive)}." for part in ("dynamics", "fused"))
     for name, value in weights.items():
-        if name.startswith(mine) and not name.endswith(
-            (".precision", ".variance")
-        ):  # those of nothing could not be fused
+        # Predictions without precision could not be fused.
+        if name.startswith(mine) and not name.endswith((".precision", ".variance")):
             value.zero_()
     shutil.copytree(checkpoint, output)
     save_file(weights, output / "model.safetensors")

@@ -229,14 +229,13 @@ def test_older_checkpoint_acts_as_it_did_whatever_the_defaults_are_now(
     assert torch.equal(older.select_action(first), saved.select_action(first))
 
 
-@pytest.mark.parametrize("preset", ["hdril", "hdril_reactive"])
-def test_a_checkpoint_that_is_damaged_on_purpose_acts_otherwise_in_one_primitive(
-    preset: str, metadata, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_fused_predictions_that_are_damaged_on_purpose_change_in_one_primitive(
+    metadata, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """``scripts/damage.py``."""
+    """``scripts/damage.py``; tests/viewer/test_view.py has the command, and a policy that is not fused."""
     monkeypatch.syspath_prepend(Path(__file__).parents[2] / "scripts")
     damage = import_module("damage").damage
-    build(metadata, preset=preset).save_pretrained(tmp_path / "whole")
+    build(metadata, preset="hdril_reactive").save_pretrained(tmp_path / "whole")
     damage(tmp_path / "whole", tmp_path / "damaged", "move")
     whole, damaged = (load(tmp_path / name) for name in ("whole", "damaged"))
     seen = observation(metadata, [15])

@@ -380,7 +380,7 @@ def test_a_trained_fused_policy_looks_as_it_learned(override: str, metadata, tmp
     assert re.match(r"policy\.(coordinates=fused needs .*; train with|replan_every must be 1, because)", told), told
 
 
-def test_noise_spares_what_no_action_tells(tmp_path: Path, metadata) -> None:
+def test_noise_spares_what_no_action_tells(metadata) -> None:
     """A policy gives the noise the names of both."""
     policy = build(metadata, preset="hdril_reactive")
     assert policy.hand_noise is not None

@@ -35,12 +35,13 @@ def played() -> tuple[BimanualEnv, Trace, Outcome]:
     return env, trace, score_episode(env.task_spec, 940_000, trace, Reference.of(env.task_spec, trace, ending), ending)
 
 
-def test_recording_holds_robot_objects_paths_lanes_and_outcome(played, tmp_path: Path) -> None:
+@pytest.mark.parametrize("ahead", [10, 1])
+def test_recording_holds_robot_objects_paths_lanes_and_outcome(ahead: int, played, tmp_path: Path) -> None:
     env, trace, outcome = played
     failed = replace(outcome, success=False, unmet="table at rest")
     explanations = [replace(e, primitive=1, attention={"table": 0.5}) if e.primitive == 2 else
                     replace(e, attention={"table": 1.0}) for e in trace.explanations if e is not None]  # fmt: skip
-    explanations[0] = replace(explanations[0], plan=trace.action[:10])
+    explanations[0] = replace(explanations[0], plan=trace.action[:ahead])
     wrong = replace(trace, explanations=tuple(explanations))
     path = write_recording(
         tmp_path, EvaluatedEpisode(env, failed, wrong, Reference.of(env.task_spec, trace, SUCCEEDED), IDENTITY)

@@ -12,7 +12,7 @@ from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_policy_hdril.graph import feature_names
-from lerobot_policy_hdril.presets import PRESETS
+from lerobot_policy_hdril.presets import PLAIN, PRESETS
 from lerobot_policy_hdril.provenance import TrainingData
 from lerobot_policy_hdril.schema import LANGUAGE, SUBTASK_KEY
 from lerobot_policy_hdril.single_frames import SingleFrameConfig
@@ -28,14 +28,7 @@ Termination = Literal["length", "learned"]
 
 _FREE = ("hidden_dim", "termination", "filter_frames", "robust", "hand_noise", "replan_every")
 """Options that may differ from the preset's value."""
-_BEFORE = {
-    "filter_frames": 1,
-    "robust": False,
-    "hand_noise": 0.0,
-    "termination": "length",
-    "coordinates": "absolute",
-    "replan_every": 0,
-}
+_BEFORE = PLAIN | {"coordinates": "absolute"}
 """Values of options whose default was another one, or which were not there, when a checkpoint without them was saved."""
 
 

@@ -14,22 +14,28 @@ _FEATURES: dict[str, dict[str, Any]] = {
 }
 # A model for all primitives is wider, to have about as many parameters as six small ones together (paper, appendix A.1).
 _SINGLE_HIDDEN, _MULTI_HIDDEN = {"none": 322, "scalar": 410}, 128
-# The paper's models look once a primitive, or never, and learn from all that they are shown.
-_PLAIN = {"termination": "length", "filter_frames": 1, "robust": False, "hand_noise": 0.0, "replan_every": 0}
+PLAIN: dict[str, Any] = {
+    "termination": "length",
+    "filter_frames": 1,
+    "robust": False,
+    "hand_noise": 0.0,
+    "replan_every": 0,
+}
+"""What the paper's models have: they look once a primitive, or never, and learn from all that they are shown."""
 
 
 def _presets() -> dict[str, dict[str, Any]]:
     absolute: dict[str, dict[str, Any]] = {}
     for name, features in _FEATURES.items():
         single = {"per_primitive": False, "hidden_dim": _SINGLE_HIDDEN[features["interaction"]]}
-        absolute[name] = _PLAIN | _AUTHORS | features | single
+        absolute[name] = PLAIN | _AUTHORS | features | single
     for name, features in _FEATURES.items():
         multi = "hdril_paper" if name == "resint" else f"{name}_multi"
-        absolute[multi] = _PLAIN | _AUTHORS | features | {"per_primitive": True, "hidden_dim": _MULTI_HIDDEN}
+        absolute[multi] = PLAIN | _AUTHORS | features | {"per_primitive": True, "hidden_dim": _MULTI_HIDDEN}
     every = {name: values | {"coordinates": "absolute", "decoder": "gru"} for name, values in absolute.items()}
     every |= {f"{name}_relational": values | {"coordinates": "relational"} for name, values in every.items()}
     every["hdril_paper_ode"] = every["hdril_paper"] | {"decoder": "ode"}
-    every["hdril"] = _PLAIN | {
+    every["hdril"] = PLAIN | {
         "interaction": "object",
         "skip": True,
         "state_skip": True,
