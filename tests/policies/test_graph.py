@@ -187,7 +187,7 @@ def test_nodes_without_a_pose_have_no_edges() -> None:
     names = [*ACTION_NAMES, "switch.state"]
     graph = ObjectAttention(names, 8)
     assert graph.node_names == ["left", "right", "switch"]
-    assert graph.edges.tolist() == [[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]]
+    assert graph.edges.bool().all(-1).tolist() == [[True, True, False], [True, True, False], [False] * 3]
     state = torch.cat([states(4)[:, : len(ACTION_NAMES)], torch.ones(4, 1)], dim=-1)
     relations = graph._relations(state)
     assert (relations[:, 2] == 0.0).all()

@@ -11,13 +11,15 @@ import pytest
 import torch
 from draccus.utils import ParsingError
 from lerobot_policy_hdril import HDRILConfig, HDRILPolicy
-from lerobot_policy_hdril.coordinates import conjugate, multiply, rotate
+from lerobot_policy_hdril.coordinates import Origins, multiply, positive
 from lerobot_policy_hdril.dynamics import StateSkip, ridge_penalty, solve_ridge, usual_windows
 from lerobot_policy_hdril.fitting import noise_covariance
 from lerobot_policy_hdril.fusion import FusedMaps, ObjectFrames
+from lerobot_policy_hdril.graph import pose_groups
 from lerobot_policy_hdril.hand_noise import ANGLE, REST, HandNoise
 from lerobot_policy_hdril.player import Choice
 from lerobot_policy_hdril.presets import PRESETS
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -48,6 +50,10 @@ def scenes(count: int, seed: int) -> Tensor:
     for _ in range(3):
         parts += [torch.rand(count, 3, generator=draw, dtype=torch.float64), turned(count, 1.0, draw)]
     return torch.cat([*parts, torch.rand(count, 1, generator=draw, dtype=torch.float64)], dim=-1)
+
+
+def rotations(quaternions: Tensor) -> Rotation:
+    return Rotation.from_quat(quaternions.numpy())
 
 
 # ---------------------------------------------------------------------- when a primitive is over
@@ -162,13 +168,32 @@ def test_a_robust_map_is_not_moved_by_what_went_wrong(robust: bool) -> None:
 # ---------------------------------------------------------------------- frames
 
 
+def test_poses_are_seen_from_a_frame_and_placed_by_it() -> None:
+    draw = generator(7)
+    frame, poses = scenes(6, 8)[:, :7], scenes(18, 9)[:, :7].reshape(6, 3, 7)
+    own = frame * torch.cat(
+        [torch.ones(6, 3), 1.0 + torch.rand(6, 1, generator=draw).expand(6, 4)], dim=-1
+    )  # of any length
+    seen = Origins.at(own).see(poses)
+    for i in range(6):
+        turn = rotations(frame[i, 3:]).inv()
+        expected = torch.from_numpy(turn.apply(poses[i, :, :3] - frame[i, :3]))
+        torch.testing.assert_close(seen[i, :, :3], expected)
+        torch.testing.assert_close(
+            seen[i, :, 3:], multiply(torch.from_numpy(turn.as_quat()).expand(3, 4), poses[i, :, 3:])
+        )
+        expected = (turn * rotations(poses[i, :, 3:])).as_quat(canonical=True)
+        torch.testing.assert_close(positive(seen[i])[:, 3:], torch.from_numpy(expected))
+    torch.testing.assert_close(Origins.at(own).place(seen), poses)
+
+
 def test_what_objects_see_does_not_change_when_the_world_is_moved() -> None:
     frames, draw = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION).double(), generator(1)
-    states, turn, shift = scenes(5, 0), turned(1, 0.5, draw), torch.tensor([0.3, -1.0, 0.2]).double()
+    states, turn, shift = scenes(5, 0), rotations(turned(1, 0.5, draw)), torch.tensor([0.3, -1.0, 0.2]).double()
     moved = states.clone()
-    for pose in frames.poses.tolist():
-        moved[:, pose[:3]] = rotate(turn.expand(5, 4), states[:, pose[:3]]) + shift
-        moved[:, pose[3:]] = multiply(turn.expand(5, 4), states[:, pose[3:]])
+    for pose in pose_groups(STATE):
+        moved[:, pose[:3]] = torch.from_numpy(turn.apply(states[:, pose[:3]])) + shift
+        moved[:, pose[3:]] = torch.from_numpy((turn * rotations(states[:, pose[3:]])).as_quat())
     before, after = frames.features(states), frames.features(moved)
     assert before.shape == (5, frames.dim) == (5, 22 + 2 * 2 * 7)
     torch.testing.assert_close(after[:, 22:], before[:, 22:])
@@ -189,8 +214,8 @@ def fitted(target: Any, count: int = 300) -> tuple[FusedMaps, ObjectFrames]:
 
 def at_cup(states: Tensor) -> Tensor:
     """10 cm before the cup and 20 to its side, turned with it."""
-    where = rotate(states[:, 10:14], torch.tensor([0.1, 0.2, 0.0]).double().expand(len(states), 3)) + states[:, 7:10]
-    return torch.cat([where, states[:, 10:14]], dim=-1)
+    beside = torch.from_numpy(rotations(states[:, 10:14]).apply([0.1, 0.2, 0.0]))
+    return torch.cat([beside + states[:, 7:10], states[:, 10:14]], dim=-1)
 
 
 def at_place(states: Tensor) -> Tensor:
@@ -223,12 +248,15 @@ def test_predictions_are_weighted_by_their_precision(dtype: torch.dtype) -> None
         turn = torch.linalg.qr(torch.randn(3, 3, generator=draw).double()).Q
         maps.precision[frame] = turn @ torch.diag(1.0 / variances) @ turn.T
     seen = torch.cat([frames.features(states), torch.ones(20, 1).double()], dim=-1)
-    origins, expected = frames.origins(states), []
+    expected = []
     for row in range(20):
         total, weighted = torch.zeros(3, 3).double(), torch.zeros(3).double()
-        for frame in range(len(origins)):
-            place, turn = origins[frame, row, :3], origins[frame, row, 3:]
-            axes = rotate(turn.expand(3, 4), torch.eye(3).double()).T
+        for frame, pose in enumerate([None, CUP, SHELF]):
+            columns = [] if pose is None else [STATE.index(name) for name in pose]
+            place = states[row, columns[:3]] if columns else torch.zeros(3).double()
+            axes = (
+                torch.from_numpy(rotations(states[row, columns[3:]]).as_matrix()) if columns else torch.eye(3).double()
+            )
             precision = axes @ maps.precision[frame, 0, 0, 0] @ axes.T
             told = axes @ (maps.weight[frame, 0, 0, :3] @ seen[row]) + place
             total, weighted = total + precision, weighted + precision @ told
@@ -292,7 +320,8 @@ def test_noise_moves_the_hands_alone_and_all_states_alike() -> None:
     angles = []
     for columns in turns:
         torch.testing.assert_close(one[:, columns].norm(dim=-1), torch.ones(20_000))
-        angles.append(2.0 * multiply(one[:, columns], conjugate(states[:, columns]))[:, :3])
+        far = rotations(one[:, columns]) * rotations(states[:, columns]).inv()
+        angles.append(torch.from_numpy(far.as_rotvec()).float())
     everything = torch.cat([moved, *angles], dim=-1)
     deviations = torch.cat([REST * std[openings], torch.full((6,), 0.01), torch.full((6,), 0.01 * ANGLE)])
     torch.testing.assert_close(everything.std(0) / deviations, torch.ones(14), atol=0.03, rtol=0)

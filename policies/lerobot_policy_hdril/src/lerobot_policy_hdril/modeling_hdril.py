@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from lerobot_policy_hdril.card import model_card
 from lerobot_policy_hdril.configuration_hdril import HDRILConfig
-from lerobot_policy_hdril.coordinates import RelationalCoordinates, unit
+from lerobot_policy_hdril.coordinates import Origins, RelationalCoordinates, unit
 from lerobot_policy_hdril.demonstrations import Demonstrations, History, Window
 from lerobot_policy_hdril.dynamics import PrimitiveDynamics, predict_stacked
 from lerobot_policy_hdril.explain import Attention, Explanation, attend, explain
@@ -45,7 +45,7 @@ _HUB_OPTIONS = (
 def _rows_by_primitive(primitive: Tensor) -> Iterator[tuple[int, Tensor | slice]]:
     """Each primitive that is in ``primitive`` (B,), and its rows. They are a slice of all if there is but one primitive: for one
     running episode, gathering rows takes as long as a small layer."""
-    present = primitive.unique().tolist()
+    present = primitive.tolist() if len(primitive) == 1 else primitive.unique().tolist()
     for k in present:
         yield k, slice(None) if len(present) == 1 else (primitive == k).nonzero().squeeze(-1)
 
@@ -332,8 +332,8 @@ class HDRILPolicy(PreTrainedPolicy):
         given = self.dynamics_input(state)
         return torch.cat([given, self.dynamics_input(filtered)], dim=-1) if self.config.filter_frames > 1 else given
 
-    def features(self, state: Tensor, filtered: Tensor) -> tuple[Tensor, Tensor]:
-        """What the fused maps see of states (B, S) and of the mean of the last ones (B, S); and the origins (1 + F, B, 7) of
+    def features(self, state: Tensor, filtered: Tensor) -> tuple[Tensor, Origins]:
+        """What the fused maps see of states (B, S) and of the mean of the last ones (B, S); and the origins (1 + F, B) of
         their frames in the states."""
         assert self.frames is not None
         given = torch.cat([state, filtered]) if self.config.filter_frames > 1 else state

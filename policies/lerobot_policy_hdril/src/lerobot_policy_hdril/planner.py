@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from lerobot_policy_hdril.decoders import run_gru
 from lerobot_policy_hdril.interaction import make_interaction
 
 
@@ -55,7 +56,7 @@ class Planner(nn.Module):
         """
         batch, time, _ = normalised.shape
         nodes = self.graph(normalised.flatten(0, 1), raw.flatten(0, 1)).unflatten(0, (batch, time))
-        hidden, last = self.gru(nodes, memory)
+        hidden, last = run_gru(self.gru, nodes, memory)
         if not self.steps:
             return self.head(hidden), last
         assert playing is not None
