@@ -334,9 +334,10 @@ def test_the_defaults_are_the_reactive_preset() -> None:
     ("values", "looks"),
     [
         ({"preset": "hdril"}, "the policy looks again when the primitive is over."),
-        ({"preset": "hdril", "replan_every": 4}, "the policy looks every 4 frames."),
+        ({"preset": "hdril", "replan_every": 4}, "the policy plans again every 4 frames."),
         ({"preset": "hdril", "rollout": "open_loop"}, "from its own predictions, without looking again."),
-        ({"preset": "hdril_reactive"}, "the policy looks at every frame."),
+        ({"preset": "hdril_reactive"}, "the policy plans again every 2 frames."),
+        ({"preset": "hdril_reactive", "replan_every": 1}, "the policy plans again at every frame."),
     ],
 )
 def test_a_card_says_when_the_policy_looks(values, looks: str, metadata) -> None:

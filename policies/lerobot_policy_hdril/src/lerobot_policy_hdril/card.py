@@ -45,9 +45,9 @@ def _looks(config: HDRILConfig) -> str:
     every = config.replan_every
     if config.rollout == "open_loop":
         return "goes on from its own predictions, without looking again"
-    return {0: "looks again when the primitive is over", 1: "looks at every frame"}.get(
-        every, f"looks every {every} frames"
-    )
+    if not every:
+        return "looks again when the primitive is over"
+    return "plans again at every frame" if every == 1 else f"plans again every {every} frames"
 
 
 def model_card(

@@ -96,7 +96,7 @@ class HDRILConfig(SingleFrameConfig):
     # Rollout.
     rollout: Rollout = "closed_loop"
     """``closed_loop`` makes each plan from what is seen; ``open_loop`` chains predictions from the first state (the paper)."""
-    replan_every: int = 1
+    replan_every: int = 2
     """Make a new plan every so many frames within a primitive as well; 0: at its start alone. A policy that was trained
     with n can be run with 0 and with any multiple of n, unless its predictions are fused."""
 

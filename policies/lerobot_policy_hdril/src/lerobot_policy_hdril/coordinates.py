@@ -21,17 +21,19 @@ _NUMBERS = torch.tensor(((3, 2, 1, 0), (2, 3, 0, 1), (1, 0, 3, 2), (0, 1, 2, 3))
 _LEFT_SIGNS = torch.tensor(
     ((1.0, -1.0, 1.0, 1.0), (1.0, 1.0, -1.0, 1.0), (-1.0, 1.0, 1.0, 1.0), (-1.0, -1.0, -1.0, 1.0))
 )
-_RIGHT_SIGNS = torch.tensor(
-    ((1.0, 1.0, -1.0, 1.0), (-1.0, 1.0, 1.0, 1.0), (1.0, -1.0, 1.0, 1.0), (-1.0, -1.0, -1.0, 1.0))
-)
-
-
+_RIGHT_SIGNS = torch.tensor(((1.0, 1.0, -1.0, 1.0), (-1.0, 1.0, 1.0, 1.0), (1.0, -1.0, 1.0, 1.0)))  # of its first rows
 _TURNS = torch.tensor([False] * 3 + [True] * 4)  # which numbers of a pose are its quaternion's
 
 
 def multiply(a: Tensor, b: Tensor) -> Tensor:
     """Products (..., 4) of quaternions, xyzw: first b, then a."""
-    return ((a[..., _NUMBERS] * _LEFT_SIGNS.to(a)) @ b[..., None]).squeeze(-1)
+    return _apply(a[..., _NUMBERS] * _LEFT_SIGNS.to(a), b)
+
+
+def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Products (..., n) of matrices (..., n, n) and vectors (..., n), as exact as sums: mixed precision and TF32 change matrix
+    products, and a pose would lose millimetres."""
+    return (matrix * vector[..., None, :]).sum(-1)
 
 
 def positive(poses: Tensor) -> Tensor:
@@ -41,8 +43,8 @@ def positive(poses: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Origins:
-    """Where frames are, as what turns the vectors and quaternions of whole lists of poses: for one running episode, a product of
-    matrices costs a third of what the same costs by components."""
+    """Where frames are, as the matrices that turn vectors and quaternions: for one running episode, they cost a third of what the
+    same costs by components."""
 
     position: Tensor  # (..., 3)
     rotation: Tensor  # (..., 3, 3), its columns are a frame's axes
@@ -52,23 +54,23 @@ class Origins:
     def at(cls, poses: Tensor) -> Origins:
         """Frames at poses (..., 7), xyz and xyzw; the quaternions need not be of unit length."""
         numbers = unit(poses[..., 3:])[..., _NUMBERS]
-        left = numbers * _LEFT_SIGNS.to(poses)
-        rotation = left @ (numbers * _RIGHT_SIGNS.to(poses)).mT  # q v q* = L(q) R(q)^T v
-        return cls(poses[..., :3], rotation[..., :3, :3], left)
+        left, right = numbers * _LEFT_SIGNS.to(poses), numbers[..., :3, :] * _RIGHT_SIGNS.to(poses)
+        rotation = _apply(right[..., None, :, :], left[..., :3, :])  # q v q* = L(q) R(q)^T v
+        return cls(poses[..., :3], rotation, left)
 
     def __getitem__(self, index: Any) -> Origins:
         return Origins(self.position[index], self.rotation[index], self.left[index])
 
     def see(self, poses: Tensor) -> Tensor:
         """Poses (..., P, 7) of the world, P for each frame, as seen from the frames."""
-        return torch.cat(
-            [(poses[..., :3] - self.position[..., None, :]) @ self.rotation, poses[..., 3:] @ self.left], dim=-1
-        )
+        offset = poses[..., :3] - self.position[..., None, :]
+        rotation, left = self.rotation.mT[..., None, :, :], self.left.mT[..., None, :, :]
+        return torch.cat([_apply(rotation, offset), _apply(left, poses[..., 3:])], dim=-1)
 
     def place(self, seen: Tensor) -> Tensor:
         """The inverse of :meth:`see`."""
-        position = seen[..., :3] @ self.rotation.mT + self.position[..., None, :]
-        return torch.cat([position, seen[..., 3:] @ self.left.mT], dim=-1)
+        position = _apply(self.rotation[..., None, :, :], seen[..., :3]) + self.position[..., None, :]
+        return torch.cat([position, _apply(self.left[..., None, :, :], seen[..., 3:])], dim=-1)
 
 
 class RelationalCoordinates(nn.Module):

@@ -56,7 +56,7 @@ class HDRILPolicy(PreTrainedPolicy):
     A state s (S,) is ``observation.state`` and ``observation.environment_state`` side by side. At every frame the
     planner turns s_0 … s_t into a distribution over primitives. When a primitive is over, the most probable one is next,
     and its dynamics model predicts the actions that remain of it, see :func:`~lerobot_policy_hdril.player.advance`. With
-    ``replan_every=1``, as by default, it predicts anew at every frame.
+    ``replan_every=2``, as by default, it predicts anew at every second frame of a primitive.
 
     Args:
         config: see :class:`HDRILConfig`.

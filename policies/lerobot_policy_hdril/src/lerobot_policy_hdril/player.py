@@ -133,10 +133,10 @@ def _next_plan(
     due: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Plans, and the frames of the primitives at which they start; new ones for the episodes that are ``due`` (B,)."""
-    if previous is None:
+    if previous is None or due.all():
         return policy.plan(state, filtered, primitive, elapsed), elapsed
-    if not due.any():
-        return previous.plan, previous.plan_start
     rows = due.nonzero().squeeze(-1)
+    if not len(rows):
+        return previous.plan, previous.plan_start
     plan = previous.plan.index_copy(0, rows, policy.plan(state[rows], filtered[rows], primitive[rows], elapsed[rows]))
     return plan, torch.where(due, elapsed, previous.plan_start)

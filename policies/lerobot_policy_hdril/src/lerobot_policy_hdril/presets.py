@@ -55,7 +55,7 @@ def _presets() -> dict[str, dict[str, Any]]:
         "filter_frames": 8,
         "robust": True,
         "hand_noise": 0.002,
-        "replan_every": 1,
+        "replan_every": 2,
     }
     every["linear_reactive"] = every["hdril_reactive"] | {"decoder": "linear"}
     return every
