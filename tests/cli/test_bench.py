@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import re
+import time
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import pytest
 
+from hdril.cli import bench
 from hdril.cli.bench import BenchConfig, Figure, bench_command, bench_recording
+from hdril.demonstrations.provenance import Recipe
 from hdril.simulation.world import World
 
 
@@ -18,6 +23,24 @@ def test_recordings_share_is_of_the_time_that_passed(tmp_path: Path) -> None:
     assert World.step is step
     assert 0.0 < figure.value < 100.0
     assert (tmp_path / "set/meta/info.json").exists()
+
+
+def test_several_processes_are_measured_against_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Here each takes as long as it waits: twice as many play twice as fast."""
+
+    def play(recipe: Recipe, seeds: Iterator[int], ranks: int) -> Generator[int]:
+        for seed in seeds:
+            time.sleep(0.02 / ranks)
+            yield seed
+
+    monkeypatch.setattr(bench, "play", play)
+    figures = bench.bench_ranks("table_lift", 9)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    assert [figure.limit for figure in figures] == [0.7 * min(ranks, cores) for ranks in (2, 4, 8)]
+    assert all(figure.at_least and figure.unit == "times" for figure in figures)
+    values = [figure.value for figure in figures]
+    assert values == sorted(values)
+    assert values[0] > 1.3
 
 
 @pytest.mark.parametrize(

@@ -400,7 +400,9 @@ def test_the_defaults_with_another_value_learn_and_act(values: dict[str, Any], m
         assert torch.equal(loaded.select_action(seen), policy.select_action(seen))
 
 
-@pytest.mark.parametrize("override", ["--rollout=open_loop", "--replan_every=0", "--replan_every=1", "--replan_every=4"])
+@pytest.mark.parametrize(
+    "override", ["--rollout=open_loop", "--replan_every=0", "--replan_every=1", "--replan_every=4"]
+)
 def test_a_trained_fused_policy_looks_as_it_learned(override: str, metadata, tmp_path: Path) -> None:
     build(metadata, preset="hdril_reactive").save_pretrained(tmp_path)
     with pytest.raises((ValueError, ParsingError)) as raised:

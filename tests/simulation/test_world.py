@@ -63,6 +63,14 @@ def test_links_collide_unless_their_pair_is_ignored(world: World, tmp_path: Path
     assert _touching(world, "spheres") == set(map(frozenset, pairs)) - set(map(frozenset, ignored))
 
 
+def test_what_is_ignored_later_adds_to_what_was(world: World, tmp_path: Path) -> None:
+    world.add_urdf("spheres", _spheres(tmp_path, 4), Pose((0.0, 0.0, 1.0)), self_collision=True)
+    world.ignore_collisions("spheres", [("s0", "s1")])
+    world.ignore_collisions("spheres", [("s1", "s2"), ("s3", "s0")])
+    world.step()
+    assert _touching(world, "spheres") == set(map(frozenset, [("s0", "s2"), ("s1", "s3"), ("s2", "s3")]))
+
+
 def test_a_second_body_has_filters_of_its_own(world: World, tmp_path: Path) -> None:
     path, at = _spheres(tmp_path, 3), Pose((0.0, 0.0, 1.0))
     for name in ("first", "second"):
