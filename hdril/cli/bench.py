@@ -21,7 +21,7 @@ from hdril.errors import UserError
 from hdril.rollout import run_episode
 from hdril.simulation.sensor import Sensor
 from hdril.simulation.world import World
-from hdril.tasks import Task, base_name, get_task
+from hdril.tasks import Task, base_name
 from hdril.tasks.expert import ScriptedExpert
 
 
