@@ -160,8 +160,8 @@ def bench_training(task: str, root: Path, steps: int, output: Path) -> Figure:
 def bench_action(root: Path) -> list[Figure]:
     """One ``select_action`` of the default policy on one core, averaged over an episode and the slowest of one.
 
-    What is seen is a demonstration, and the policy has trained for as long as its planner needs to follow it: it makes a plan when
-    a primitive begins, and a planner that has learned nothing begins one at every frame.
+    What is seen is a demonstration, and the policy has trained for as long as its planner needs to follow it. A plan is made when
+    a primitive begins, too, and a planner that has learned nothing begins one at every frame.
     """
     import torch
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
