@@ -160,8 +160,8 @@ def bench_training(task: str, root: Path, steps: int, output: Path) -> Figure:
 def bench_action(root: Path) -> list[Figure]:
     """One ``select_action`` of the default policy on one core, averaged over an episode and the slowest of one.
 
-    What is seen is a demonstration, and the policy has trained for as long as its planner needs to follow it. A plan is made when
-    a primitive begins, too, and a planner that has learned nothing begins one at every frame.
+    It is shown a demonstration, after enough training for its planner to follow. A policy makes a plan whenever a primitive
+    begins, and an untrained planner begins one at every frame.
     """
     import torch
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -173,8 +173,9 @@ def bench_action(root: Path) -> list[Figure]:
     policy = make_policy(HDRILConfig(device="cpu", push_to_hub=False), ds_meta=dataset.meta)
     _samples_per_second(policy, {"index": torch.arange(0, dataset.meta.total_frames, 5)}, 60)
     policy.eval()
-    episode = range(dataset.meta.episodes[0]["length"])
-    seen = [{key: value[None] for key, value in dataset[i].items() if "observation" in key} for i in episode]
+    assert dataset.meta.episodes is not None
+    items: list[Any] = [dataset[i] for i in range(dataset.meta.episodes[0]["length"])]
+    seen = [{key: value[None] for key, value in item.items() if "observation" in key} for item in items]
 
     def play() -> list[float]:
         policy.reset()

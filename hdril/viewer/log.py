@@ -129,9 +129,8 @@ class EpisodeLog:
         for frame, explanation in explanations.items():
             if explanation.plan is None:
                 continue
-            poses = hand_poses(explanation.plan)
-            if len(poses) == 1:  # a plan of one action leads from where the hands are
-                poses = np.concatenate([hand_poses(self._trace.state[frame : frame + 1]), poses])
+            # A plan leads from where the hands are.
+            poses = np.concatenate([hand_poses(self._trace.state[frame : frame + 1]), hand_poses(explanation.plan)])
             fading = np.linspace(255, 50, len(poses) - 1).astype(int)
             for i, side in enumerate(SIDES):
                 path = poses[:, i, :3]

@@ -138,10 +138,13 @@ def test_plan_undoes_what_the_target_did(coordinates: str, metadata, monkeypatch
     torch.testing.assert_close(plan[window.mask], window.target[window.mask], atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize("preset", ["hdril", "hdril_paper", "res_multi_relational", "hdril_reactive"])
-def test_stacked_models_are_the_separate_ones(preset: str, metadata) -> None:
+@pytest.mark.parametrize(
+    ("preset", "every"),
+    [("hdril", 4), ("hdril_paper", 4), ("res_multi_relational", 4), ("hdril_reactive", 4), ("hdril_reactive", 1)],
+)
+def test_stacked_models_are_the_separate_ones(preset: str, every: int, metadata) -> None:
     """Same predictions with several primitives in the batch, same loss gradients, at the start and within primitives."""
-    values = {"preset": preset, "replan_every": 4}
+    values = {"preset": preset, "replan_every": every}
     separate, stacked = (build(metadata, experts=how, **values) for how in ("separate", "stacked"))
     with torch.no_grad():  # the head starts at zero where there are linear maps
         for policy in (separate, stacked):
@@ -151,7 +154,7 @@ def test_stacked_models_are_the_separate_ones(preset: str, metadata) -> None:
     rows = torch.tensor([0, 3, 25, 15, 69, 70, 101, 140, 30, 31])
     gradients = []
     for policy in (separate.eval(), stacked.eval()):
-        window = demonstrations(policy).window(rows, 4, policy.ahead)
+        window = demonstrations(policy).window(rows, every, policy.ahead)
         predicted = policy.predict(window.state, window.filtered, window.primitive, window.elapsed)
         policy.dynamics_loss(window)[0].backward()
         gradients.append([*predicted, *(p.grad for p in policy.dynamics.parameters() if p.grad is not None)])
@@ -334,10 +337,14 @@ def test_the_defaults_are_the_reactive_preset() -> None:
     ("values", "looks"),
     [
         ({"preset": "hdril"}, "the policy looks again when the primitive is over."),
-        ({"preset": "hdril", "replan_every": 4}, "the policy plans again every 4 frames."),
+        ({"preset": "hdril", "replan_every": 4}, "the policy looks every 4 frames."),
         ({"preset": "hdril", "rollout": "open_loop"}, "from its own predictions, without looking again."),
-        ({"preset": "hdril_reactive"}, "the policy plans again every 2 frames."),
-        ({"preset": "hdril_reactive", "replan_every": 1}, "the policy plans again at every frame."),
+        (
+            {"preset": "hdril", "termination": "learned"},
+            "at every frame which one plays, and plans when a primitive begins.",
+        ),
+        ({"preset": "hdril_reactive"}, "the policy decides at every frame which one plays, and plans every 2 frames."),
+        ({"preset": "hdril_reactive", "replan_every": 1}, "at every frame which one plays, and plans at every frame."),
     ],
 )
 def test_a_card_says_when_the_policy_looks(values, looks: str, metadata) -> None:

@@ -12,6 +12,7 @@ import torch
 from draccus.utils import ParsingError
 from lerobot_policy_hdril import HDRILConfig, HDRILPolicy
 from lerobot_policy_hdril.coordinates import Origins, multiply, positive
+from lerobot_policy_hdril.decoders import run_gru
 from lerobot_policy_hdril.dynamics import StateSkip, ridge_penalty, solve_ridge, usual_windows
 from lerobot_policy_hdril.fitting import noise_covariance
 from lerobot_policy_hdril.fusion import FusedMaps, ObjectFrames
@@ -171,6 +172,7 @@ def test_a_robust_map_is_not_moved_by_what_went_wrong(robust: bool) -> None:
 def test_poses_are_seen_from_a_frame_and_placed_by_it() -> None:
     draw = generator(7)
     frame, poses = scenes(6, 8)[:, :7], scenes(18, 9)[:, :7].reshape(6, 3, 7)
+    poses[1::2, 1, 3:] *= -1.0  # the same rotation
     own = frame * torch.cat(
         [torch.ones(6, 3), 1.0 + torch.rand(6, 1, generator=draw).expand(6, 4)], dim=-1
     )  # of any length
@@ -185,6 +187,58 @@ def test_poses_are_seen_from_a_frame_and_placed_by_it() -> None:
         expected = (turn * rotations(poses[i, :, 3:])).as_quat(canonical=True)
         torch.testing.assert_close(positive(seen[i])[:, 3:], torch.from_numpy(expected))
     torch.testing.assert_close(Origins.at(own).place(seen), poses)
+    with torch.autocast("cpu", torch.bfloat16):  # half a millimetre of a metre would be lost
+        coarse = Origins.at(own.float())
+        torch.testing.assert_close(coarse.see(poses.float()), seen.float())
+        torch.testing.assert_close(coarse.place(seen.float()), poses.float())
+
+
+def test_an_object_may_have_the_only_pose() -> None:
+    frames = ObjectFrames(["left.joint", *CUP], CUP, ACTION).double()
+    states = torch.cat([torch.rand(5, 1).double(), scenes(5, 0)[:, :7]], dim=-1)
+    torch.testing.assert_close(frames.features(states), states)
+    assert frames.dim == 8
+
+
+def test_each_step_of_a_plan_has_maps_of_its_own_by_where_the_plan_starts() -> None:
+    frames, states = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION).double(), scenes(400, 2)
+    maps, start = FusedMaps(frames.dim, frames, 2, 2).double(), torch.arange(400) % 2
+
+    def actions(states: Tensor, start: Tensor) -> Tensor:
+        """The hand is by the cup, 10 cm further along its axis at each step, and 40 cm in plans that start later."""
+        plan = torch.cat([at_cup(states), states[:, -1:]], dim=-1)[:, None].repeat(1, 2, 1)
+        axis = torch.from_numpy(rotations(states[:, 10:14]).apply([0.0, 0.0, 1.0]))[:, None]
+        plan[..., :3] += (0.1 * torch.arange(2) + 0.4 * start[:, None])[..., None] * axis
+        return plan
+
+    noise = torch.zeros(frames.dim, frames.dim)
+    mask = torch.ones(400, 2, dtype=torch.bool)
+    maps.fit(frames.features(states), start, frames, states, actions(states, start), mask, 1e-6, False, noise)
+    states, start = scenes(20, 3), torch.arange(20) // 3 % 2
+    told = maps(frames.features(states), start, frames, frames.origins(states))
+    torch.testing.assert_close(told[..., :3], actions(states, start)[..., :3], atol=2e-3, rtol=0)
+
+
+def test_a_gru_step_by_step_is_the_gru() -> None:
+    gru, inputs = torch.nn.GRU(3, 5, batch_first=True), torch.randn(2, 4, 3, generator=generator())
+    expected, last = gru(inputs)
+    hidden, path = None, []
+    for step in inputs.split(1, dim=1):
+        output, hidden = run_gru(gru, step, hidden)
+        path.append(output)
+    torch.testing.assert_close(torch.cat(path, dim=1), expected)
+    torch.testing.assert_close(hidden, last)
+    torch.testing.assert_close(run_gru(gru, inputs)[0], expected)
+
+
+def test_mixed_precision_moves_a_plan_by_less_than_a_millimetre(metadata) -> None:
+    policy = build(metadata, preset="hdril_reactive").eval()
+    window = demonstrations(policy).window(BATCH, 2, 2)
+    seen = window.state, window.filtered, window.primitive, window.elapsed
+    plan = policy.plan(*seen)
+    with torch.autocast("cpu", torch.bfloat16):
+        coarse = policy.plan(*seen)
+    torch.testing.assert_close(coarse[..., 1:4], plan[..., 1:4], atol=1e-3, rtol=0)
 
 
 def test_what_objects_see_does_not_change_when_the_world_is_moved() -> None:
@@ -194,6 +248,7 @@ def test_what_objects_see_does_not_change_when_the_world_is_moved() -> None:
     for pose in pose_groups(STATE):
         moved[:, pose[:3]] = torch.from_numpy(turn.apply(states[:, pose[:3]])) + shift
         moved[:, pose[3:]] = torch.from_numpy((turn * rotations(states[:, pose[3:]])).as_quat())
+    moved[1::2, 10:14] *= -1.0  # the same rotation
     before, after = frames.features(states), frames.features(moved)
     assert before.shape == (5, frames.dim) == (5, 22 + 2 * 2 * 7)
     torch.testing.assert_close(after[:, 22:], before[:, 22:])

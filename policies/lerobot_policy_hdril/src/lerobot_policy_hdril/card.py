@@ -45,9 +45,10 @@ def _looks(config: HDRILConfig) -> str:
     every = config.replan_every
     if config.rollout == "open_loop":
         return "goes on from its own predictions, without looking again"
-    if not every:
-        return "looks again when the primitive is over"
-    return "plans again at every frame" if every == 1 else f"plans again every {every} frames"
+    plans = {0: "when a primitive begins", 1: "at every frame"}.get(every, f"every {every} frames")
+    if config.termination == "learned":
+        return f"decides at every frame which one plays, and plans {plans}"
+    return f"looks {plans}" if every else "looks again when the primitive is over"
 
 
 def model_card(

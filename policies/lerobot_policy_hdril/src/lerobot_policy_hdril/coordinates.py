@@ -21,7 +21,9 @@ _NUMBERS = torch.tensor(((3, 2, 1, 0), (2, 3, 0, 1), (1, 0, 3, 2), (0, 1, 2, 3))
 _LEFT_SIGNS = torch.tensor(
     ((1.0, -1.0, 1.0, 1.0), (1.0, 1.0, -1.0, 1.0), (-1.0, 1.0, 1.0, 1.0), (-1.0, -1.0, -1.0, 1.0))
 )
-_RIGHT_SIGNS = torch.tensor(((1.0, 1.0, -1.0, 1.0), (-1.0, 1.0, 1.0, 1.0), (1.0, -1.0, 1.0, 1.0)))  # of its first rows
+_RIGHT_SIGNS = torch.tensor(
+    ((1.0, 1.0, -1.0, 1.0), (-1.0, 1.0, 1.0, 1.0), (1.0, -1.0, 1.0, 1.0))
+)  # of its first three rows
 _TURNS = torch.tensor([False] * 3 + [True] * 4)  # which numbers of a pose are its quaternion's
 
 
@@ -41,10 +43,10 @@ def positive(poses: Tensor) -> Tensor:
     return torch.where((poses[..., 6:] < 0) & _TURNS.to(poses.device), -poses, poses)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Origins:
-    """Where frames are, as the matrices that turn vectors and quaternions: for one running episode, they cost a third of what the
-    same costs by components."""
+    """Where frames are, as the matrices that turn vectors and quaternions. For one running episode, they take a third of the time
+    that the formulas by components take."""
 
     position: Tensor  # (..., 3)
     rotation: Tensor  # (..., 3, 3), its columns are a frame's axes

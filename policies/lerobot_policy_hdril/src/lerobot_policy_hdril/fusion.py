@@ -46,6 +46,7 @@ class ObjectFrames(nn.Module):
         columns = {"frames": frames, "seen": others, "hands": hands, "rest": rest}
         for name, value in columns.items():
             self.register_buffer(name, torch.tensor(value, dtype=torch.long), persistent=False)
+        self.seen = self.seen.reshape(len(frames), len(poses) - 1, 7)  # where an object has the only pose, too
         self.register_buffer("world", torch.eye(7)[6], persistent=False)
         self.dim = len(state_names) + 7 * sum(map(len, others))
 
@@ -56,7 +57,7 @@ class ObjectFrames(nn.Module):
     world: Tensor  # (7,), its pose
 
     def origins(self, state: Tensor) -> Origins:
-        """Those (1 + F, B) of the world and of the objects in states (B, S)."""
+        """The frames (1 + F, B) of the world and of the objects in states (B, S)."""
         return Origins.at(
             torch.cat([self.world.to(state).expand(1, len(state), 7), state[:, self.frames].transpose(0, 1)])
         )
@@ -175,7 +176,8 @@ class FusedMaps(nn.Module):
         poses = origins[:, :, None].place(told)
         means, axes = poses[..., :3], origins.rotation[:, :, None, None]
         precision = axes @ self.precision.index_select(1, start) @ axes.mT
-        # Of the differences from the world's mean, which are small: precisions may differ by five orders of magnitude.
+        # Of the differences from the world's mean, which are small: precisions may differ by five orders of magnitude, and mixed
+        # precision may round them.
         far = (precision @ (means - means[:1])[..., None]).sum(0)
         position = means[0] + torch.linalg.solve(precision.sum(0), far)[..., 0]
         rotations = unit(poses[..., 3:])

@@ -113,7 +113,7 @@ class ObjectAttention(nn.Module):
 
     def _nodes(self, normalised: Tensor) -> Tensor:
         features = F.pad(normalised, (0, 1))[:, self.columns].transpose(0, 1)  # (N, B, F)
-        return torch.baddbmm(self.identity[:, None], features, self.embed).transpose(0, 1)
+        return (torch.bmm(features, self.embed) + self.identity[:, None]).transpose(0, 1)
 
     def _relations(self, raw: Tensor) -> Tensor:
         """r_uv (B, N, N, 7): position, dm, and quaternion; 0 without poses."""
