@@ -170,13 +170,10 @@ def test_a_robust_map_is_not_moved_by_what_went_wrong(robust: bool) -> None:
 
 
 def test_poses_are_seen_from_a_frame_and_placed_by_it() -> None:
-    draw = generator(7)
     frame, poses = scenes(6, 8)[:, :7], scenes(18, 9)[:, :7].reshape(6, 3, 7)
     poses[1::2, 1, 3:] *= -1.0  # the same rotation
-    own = frame * torch.cat(
-        [torch.ones(6, 3), 1.0 + torch.rand(6, 1, generator=draw).expand(6, 4)], dim=-1
-    )  # of any length
-    seen = Origins.at(own).see(poses)
+    origins = Origins.at(frame[:, :3], frame[:, 3:])
+    seen = origins.see(poses)
     for i in range(6):
         turn = rotations(frame[i, 3:]).inv()
         expected = torch.from_numpy(turn.apply(poses[i, :, :3] - frame[i, :3]))
@@ -186,9 +183,9 @@ def test_poses_are_seen_from_a_frame_and_placed_by_it() -> None:
         )
         expected = (turn * rotations(poses[i, :, 3:])).as_quat(canonical=True)
         torch.testing.assert_close(positive(seen[i])[:, 3:], torch.from_numpy(expected))
-    torch.testing.assert_close(Origins.at(own).place(seen), poses)
-    with torch.autocast("cpu", torch.bfloat16):  # half a millimetre of a metre would be lost
-        coarse = Origins.at(own.float())
+    torch.testing.assert_close(origins.place(seen), poses)
+    with torch.autocast("cpu", torch.bfloat16):  # bfloat16 would lose millimetres of a metre
+        coarse = Origins.at(frame[:, :3].float(), frame[:, 3:].float())
         torch.testing.assert_close(coarse.see(poses.float()), seen.float())
         torch.testing.assert_close(coarse.place(seen.float()), poses.float())
 

@@ -53,12 +53,12 @@ class Origins:
     left: Tensor  # (..., 4, 4), of products with the frame's quaternion from the left
 
     @classmethod
-    def at(cls, poses: Tensor) -> Origins:
-        """Frames at poses (..., 7), xyz and xyzw; the quaternions need not be of unit length."""
-        numbers = unit(poses[..., 3:])[..., _NUMBERS]
-        left, right = numbers * _LEFT_SIGNS.to(poses), numbers[..., :3, :] * _RIGHT_SIGNS.to(poses)
+    def at(cls, position: Tensor, quaternion: Tensor) -> Origins:
+        """Frames at positions (..., 3), turned by unit quaternions (..., 4), xyzw."""
+        numbers = quaternion[..., _NUMBERS]
+        left, right = numbers * _LEFT_SIGNS.to(numbers), numbers[..., :3, :] * _RIGHT_SIGNS.to(numbers)
         rotation = _apply(right[..., None, :, :], left[..., :3, :])  # q v q* = L(q) R(q)^T v
-        return cls(poses[..., :3], rotation, left)
+        return cls(position, rotation, left)
 
     def __getitem__(self, index: Any) -> Origins:
         return Origins(self.position[index], self.rotation[index], self.left[index])
@@ -108,7 +108,8 @@ class RelationalCoordinates(nn.Module):
     outputs: Tensor
 
     def _origin(self, state: Tensor) -> Origins:
-        return Origins.at(positive(state[..., self.frame]))
+        pose = positive(state[..., self.frame])
+        return Origins.at(pose[..., :3], unit(pose[..., 3:]))
 
     def encode_state(self, state: Tensor) -> Tensor:
         """States (..., S) with hands and other objects seen from the frame."""

@@ -58,9 +58,8 @@ class ObjectFrames(nn.Module):
 
     def origins(self, state: Tensor) -> Origins:
         """The frames (1 + F, B) of the world and of the objects in states (B, S)."""
-        return Origins.at(
-            torch.cat([self.world.to(state).expand(1, len(state), 7), state[:, self.frames].transpose(0, 1)])
-        )
+        poses = torch.cat([self.world.to(state).expand(1, len(state), 7), state[:, self.frames].transpose(0, 1)])
+        return Origins.at(poses[..., :3], unit(poses[..., 3:]))
 
     def features(self, state: Tensor, origins: Origins | None = None) -> Tensor:
         """States (B, S) and beside them (B, D - S) the poses of everything in every object's frame; w >= 0. ``origins`` are those

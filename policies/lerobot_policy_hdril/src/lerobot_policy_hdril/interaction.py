@@ -118,9 +118,9 @@ class ObjectAttention(nn.Module):
     def _relations(self, raw: Tensor) -> Tensor:
         """r_uv (B, N, N, 7): position, dm, and quaternion; 0 without poses."""
         poses = raw[:, self.poses]
-        origins = Origins.at(poses)
-        poses = torch.cat([poses[..., :3], unit(poses[..., 3:])], dim=-1)
-        return positive(origins.see(poses[:, None])) * self.edges
+        position, quaternion = poses[..., :3], unit(poses[..., 3:])
+        seen = Origins.at(position, quaternion).see(torch.cat([position, quaternion], dim=-1)[:, None])
+        return positive(seen) * self.edges
 
     def _weights(self, nodes: Tensor, relations: Tensor) -> Tensor:
         to, source = self.score(nodes).unbind(-1)
