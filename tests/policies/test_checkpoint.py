@@ -208,15 +208,28 @@ def test_weights_that_are_missing_unknown_or_of_another_shape(damaged: Path) -> 
 @pytest.mark.parametrize(
     ("preset", "later"),
     [
-        ("hdril", ["termination", "filter_frames", "robust", "hand_noise", "coordinates", "replan_every"]),
-        ("hdril_reactive", ["hand_noise"]),
+        (
+            "hdril",
+            [
+                "termination",
+                "filter_frames",
+                "long_filter_frames",
+                "robust",
+                "hand_noise",
+                "coordinates",
+                "replan_every",
+            ],
+        ),
+        ("hdril_reactive", ["long_filter_frames"]),
+        ("hdril_reactive", ["hand_noise", "long_filter_frames"]),
     ],
 )
 def test_older_checkpoint_acts_as_it_did_whatever_the_defaults_are_now(
     preset: str, later: list[str], metadata, tmp_path: Path
 ) -> None:
     """Its config lacks the options that came later."""
-    saved = build(metadata, preset=preset, hidden_dim=32, hand_noise=0.0).eval()
+    plain = {"hand_noise": 0.0} if "hand_noise" in later else {}
+    saved = build(metadata, preset=preset, hidden_dim=32, long_filter_frames=1, **plain).eval()
     saved.save_pretrained(tmp_path)
     values = json.loads((tmp_path / "config.json").read_text())
     for name in later:
@@ -240,8 +253,9 @@ def test_fused_predictions_that_are_damaged_on_purpose_change_in_one_primitive(
     whole, damaged = (load(tmp_path / name) for name in ("whole", "damaged"))
     seen = observation(metadata, [15])
     state = torch.cat([seen["observation.state"], seen["observation.environment_state"]], dim=-1)
+    means = state[:, None].expand(-1, len(whole.config.filters), -1)
     for primitive, name in enumerate(whole.config.primitives):
-        plans = [policy.plan(state, state, torch.tensor([primitive]), torch.tensor([0])) for policy in (whole, damaged)]
+        plans = [policy.plan(state, means, torch.tensor([primitive]), torch.tensor([0])) for policy in (whole, damaged)]
         assert torch.equal(*plans) == (name != "move")
         assert plans[1].isfinite().all()
 

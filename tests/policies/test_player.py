@@ -19,7 +19,7 @@ class Scripted:
     """A policy of three primitives that wants what it is told, row by row, and plans 100 k + (frame of the primitive)."""
 
     def __init__(self, wishes: list[list[int]], **config) -> None:
-        self.config = SimpleNamespace(**{"rollout": "closed_loop", "replan_every": 0, "filter_frames": 1} | config)
+        self.config = SimpleNamespace(**{"rollout": "closed_loop", "replan_every": 0, "filters": []} | config)
         self.shortest_length, self.longest_length = torch.tensor(SHORTEST), torch.tensor(LONGEST)
         self.wishes, self.planned_from, self.filtered = iter(wishes), [], []
 
@@ -29,7 +29,7 @@ class Scripted:
 
     def plan(self, state, filtered, primitive, elapsed):
         self.planned_from.append((state[:, 0].tolist(), primitive.tolist(), elapsed.tolist()))
-        self.filtered.append(filtered[:, 0].tolist())
+        self.filtered.append(filtered[:, :, 0].tolist())
         steps = 100 * primitive[:, None] + elapsed[:, None] + torch.arange(6)
         # One action, and one number of state.
         return torch.stack([steps, steps + 0.5], dim=-1)

@@ -288,8 +288,8 @@ def test_linear_maps_alone_predict_what_the_whole_does_before_its_network_learns
     assert list(whole.dynamics.parameters())
     state = torch.cat([observation(metadata, [5, 40])[key] for key in (OBS_STATE, OBS_ENV_STATE)], dim=-1)
     primitive, elapsed = torch.tensor([0, 2]), torch.tensor([0, 0])
-    given = alone.plan(state, state, primitive, elapsed)
-    assert torch.equal(given, whole.plan(state, state, primitive, elapsed))
+    given = alone.plan(state, state[:, None][:, :0], primitive, elapsed)
+    assert torch.equal(given, whole.plan(state, state[:, None][:, :0], primitive, elapsed))
     assert given.std() > 0.1
 
 
@@ -351,7 +351,7 @@ def test_a_card_says_when_the_policy_looks(values, looks: str, metadata) -> None
     policy = build(metadata, **values)
     text = str(model_card(policy.config, "user/set", None, None, None, metadata))
     assert looks in text
-    for name in ("termination", "filter_frames", "robust", "hand_noise"):
+    for name in ("termination", "filter_frames", "long_filter_frames", "robust", "hand_noise"):
         assert f"`{getattr(policy.config, name)}`" in text.partition(f"| `{name}`")[2].partition("\n")[0]
 
 

@@ -90,10 +90,12 @@ def test_what_goes_on_counts_as_the_primitive_that_plays() -> None:
     assert states[1].probabilities.tolist() == [[0.75, 0.25, 0.0]]
 
 
-def test_the_filter_is_the_mean_of_the_last_states() -> None:
-    policy = Scripted([[0]] * 6, replan_every=1, filter_frames=3)
+@pytest.mark.parametrize("filters", [[], [3], [3, 5], [5, 3]])
+def test_the_filters_are_means_of_the_last_states(filters: list[int]) -> None:
+    policy = Scripted([[0]] * 6, replan_every=1, filters=filters)
     play(policy, 6)
-    assert policy.filtered == [[0.0], [0.5], [1.0], [2.0], [3.0], [4.0]]
+    means = {3: [0.0, 0.5, 1.0, 2.0, 3.0, 4.0], 5: [0.0, 0.5, 1.0, 1.5, 2.0, 3.0]}
+    assert policy.filtered == [[[means[frames][t] for frames in filters]] for t in range(6)]
 
 
 def test_histories_say_what_played_and_what_begins(metadata) -> None:
@@ -104,15 +106,33 @@ def test_histories_say_what_played_and_what_begins(metadata) -> None:
     assert history.elapsed[0, :13].tolist() == [*range(11), 1, 2]
 
 
-def test_the_filter_of_the_demonstrations_is_the_one_of_the_policy(metadata) -> None:
-    policy = build(metadata, preset="hdril_reactive", hidden_dim=32).eval()
-    data = demonstrations(policy)
-    assert policy.config.filter_frames == 8
-    for t in range(20):
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ({}, [8, 24]),
+        ({"filter_frames": 5}, [5, 24]),
+        ({"long_filter_frames": 1}, [8]),
+        ({"filter_frames": 1, "long_filter_frames": 1}, []),
+    ],
+)
+def test_the_filters_of_the_demonstrations_are_those_of_the_policy(
+    values: dict[str, int], expected: list[int], metadata, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = build(metadata, preset="hdril_reactive", hidden_dim=32, **values).eval()
+    data, seen = demonstrations(policy), []
+    assert policy.config.filters == expected
+    plan = policy.plan
+    monkeypatch.setattr(policy, "plan", lambda *given: seen.append(given[1][0]) or plan(*given))
+    for t in range(30):
         policy.select_action(observation(metadata, [FRAMES + t]))
-        assert policy._playback is not None
-        torch.testing.assert_close(policy._playback.recent.mean(1)[0], data.filtered[FRAMES + t])
-    torch.testing.assert_close(data.filtered[FRAMES], data.state[FRAMES])
+        if len(seen) > t:  # a plan was made at this frame
+            torch.testing.assert_close(seen[-1], data.filtered[FRAMES + t])
+        else:
+            seen.append(None)
+    for t, frames in enumerate(expected):
+        for last in (0, 3, 29):
+            mean = data.state[FRAMES + max(last + 1 - frames, 0) : FRAMES + last + 1].mean(0)
+            torch.testing.assert_close(data.filtered[FRAMES + last, t], mean)
 
 
 def test_a_trained_planner_goes_through_the_primitives(metadata) -> None:
@@ -331,11 +351,15 @@ def test_a_fused_policy_says_what_it_needs(metadata) -> None:
         ValueError, match=r"^policy\.coordinates=fused needs poses of objects and .* policy\.preset=hdril needs none$"
     ):
         ObjectFrames(STATE, [], ACTION)
-    with pytest.raises(
-        ValueError, match=r"^policy\.filter_frames is for policy\.state_skip=true; got 8 and state_skip=false$"
-    ):
-        HDRILConfig(device="cpu", push_to_hub=False, coordinates="absolute", state_skip=False, filter_frames=8)
-    assert HDRILConfig(device="cpu", push_to_hub=False, coordinates="absolute", state_skip=False).filter_frames == 1
+    plain: dict[str, Any] = {"device": "cpu", "push_to_hub": False, "coordinates": "absolute", "state_skip": False}
+    for name in ("filter_frames", "long_filter_frames"):
+        with pytest.raises(
+            ValueError, match=rf"^policy\.{name} is for policy\.state_skip=true; got 8 and state_skip=false$"
+        ):
+            HDRILConfig(**plain, **{name: 8})
+        with pytest.raises(ValueError, match=rf"^policy\.{name} must be at least 1, got 0$"):
+            HDRILConfig(device="cpu", push_to_hub=False, **{name: 0})
+    assert HDRILConfig(**plain).filters == []
     with pytest.raises(
         ValueError, match=r"^policy\.decoder=ode is integrated over a plan, and policy\.coordinates=fused "
     ):
@@ -488,8 +512,8 @@ def test_the_fit_bears_the_noise_that_the_option_asks_for(metadata) -> None:
     window = replace(window, state=window.state.double(), filtered=window.filtered.double())
     covariance = noise_covariance(noisy, window, noisy.features(window.state, window.filtered)[0])
     place = noisy.config.state_names.index("left_ee.x")
-    half = len(noisy.feature_std)
-    for column in (place, half + place):  # of the present state, and of the mean of the last ones
+    # Of the present state, and of the means of the last ones.
+    for column in place + len(noisy.feature_std) * torch.arange(3):
         expected = (0.002 / noisy.feature_std[place].double()) ** 2
         torch.testing.assert_close(covariance[column, column], expected, rtol=0.15, atol=0)
     table = noisy.config.environment_names.index("table.x") + len(noisy.config.state_names)

@@ -26,8 +26,10 @@ Experts = Literal["auto", "separate", "stacked"]
 Termination = Literal["length", "learned"]
 
 
-_FREE = ("hidden_dim", "termination", "filter_frames", "robust", "hand_noise", "replan_every")
+_FREE = ("hidden_dim", "termination", "filter_frames", "long_filter_frames", "robust", "hand_noise", "replan_every")
 """Options that may differ from the preset's value."""
+_FILTERS = ("filter_frames", "long_filter_frames")
+"""Options that say over how many states a mean is that the linear maps see."""
 _BEFORE = PLAIN | {"coordinates": "absolute"}
 """Values of options whose default was another one, or which were not there, when a checkpoint without them was saved."""
 
@@ -52,9 +54,9 @@ class HDRILConfig(SingleFrameConfig):
     # Variant.
     preset: str = ""
     """Name of a model in :data:`~lerobot_policy_hdril.presets.PRESETS`, which then decides the values of this group, and
-    ``hidden_dim``. ``hidden_dim``, ``termination``, ``filter_frames``, ``robust``, ``hand_noise`` and ``replan_every`` may be
-    given nevertheless, where the model has a use for them. Empty to set them one by one. Once the policy has learned it is a
-    name only."""
+    ``hidden_dim``. ``hidden_dim``, ``termination``, ``filter_frames``, ``long_filter_frames``, ``robust``, ``hand_noise`` and
+    ``replan_every`` may be given nevertheless, where the model has a use for them. Empty to set them one by one. Once the
+    policy has learned it is a name only."""
     interaction: Interaction = "object"
     """Graph attention: ``none``; ``scalar``, the paper's node per number of the state; ``object``, a node per object."""
     skip: bool = True
@@ -64,6 +66,9 @@ class HDRILConfig(SingleFrameConfig):
     filter_frames: int = 8
     """The linear maps see the mean of the last so many states beside the present one: observations are noisy. 1: no mean. It
     is 1 without ``state_skip``, which has the maps."""
+    long_filter_frames: int = 24
+    """The same for a second mean. A short one follows what moves, a long one tells best where something rests; the fit of the
+    maps weighs them."""
     robust: bool = True
     """Leave out of the linear maps' fit what is far off it, and train the network with Huber's loss: in demonstrations of
     scenes where something goes wrong, some windows show how that was mended."""
@@ -173,8 +178,10 @@ class HDRILConfig(SingleFrameConfig):
             self._apply_preset()
         if self.coordinates != "fused" and "hand_noise" not in self._given:
             self.hand_noise = 0.0
-        if not self.state_skip and self.coordinates != "fused" and "filter_frames" not in self._given:
-            self.filter_frames = 1
+        if not self.state_skip and self.coordinates != "fused":
+            for name in _FILTERS:
+                if name not in self._given:
+                    setattr(self, name, 1)
         _check_choice("interaction", self.interaction, Interaction)
         _check_choice("decoder", self.decoder, Decoder)
         _check_choice("rollout", self.rollout, Rollout)
@@ -182,7 +189,7 @@ class HDRILConfig(SingleFrameConfig):
         _check_choice("latent", self.latent, Latent)
         _check_choice("experts", self.experts, Experts)
         _check_choice("termination", self.termination, Termination)
-        for name in ("hidden_dim", "node_dim", "planner_hidden_dim", "planner_batch_size", "filter_frames"):
+        for name in ("hidden_dim", "node_dim", "planner_hidden_dim", "planner_batch_size", *_FILTERS):
             if getattr(self, name) < 1:
                 raise ValueError(f"policy.{name} must be at least 1, got {getattr(self, name)}")
         if self.ridge <= 0:
@@ -202,10 +209,11 @@ class HDRILConfig(SingleFrameConfig):
             )
         if self.coordinates == "fused":
             self._check_fused()
-        if self.filter_frames > 1 and not self.state_skip:
-            raise ValueError(
-                f"policy.filter_frames is for policy.state_skip=true; got {self.filter_frames} and state_skip=false"
-            )
+        for name in _FILTERS:
+            if getattr(self, name) > 1 and not self.state_skip:
+                raise ValueError(
+                    f"policy.{name} is for policy.state_skip=true; got {getattr(self, name)} and state_skip=false"
+                )
         if self.hand_noise < 0 or (self.hand_noise and self.coordinates != "fused"):
             raise ValueError(
                 "policy.hand_noise must not be negative, and is for policy.coordinates=fused; "
@@ -254,6 +262,11 @@ class HDRILConfig(SingleFrameConfig):
                 raise ValueError(
                     f"policy.preset={self.preset} makes policy.{name} {value!r}, but {given!r} was given; leave out one"
                 )
+
+    @property
+    def filters(self) -> list[int]:
+        """Over how many of the last states each mean is that the linear maps see."""
+        return [frames for frames in (self.filter_frames, self.long_filter_frames) if frames > 1]
 
     def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
         """Learn what each number of state and action is called. LeRobot calls this when it trains.

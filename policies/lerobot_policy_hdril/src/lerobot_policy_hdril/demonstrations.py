@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -31,8 +32,8 @@ if TYPE_CHECKING:
 class Window:
     """The rest of a primitive from a frame on, for B samples, padded to M frames.
 
-    ``state`` (B, S) is what is seen at the start, ``filtered`` (B, S) the mean of the last states there; ``elapsed`` (B,) how
-    many frames of the primitive are over by then; ``target`` (B, M, A + S) the actions and the states that they lead to;
+    ``state`` (B, S) is what is seen at the start, ``filtered`` (B, W, S) the means of the last states there; ``elapsed``
+    (B,) how many frames of the primitive are over by then; ``target`` (B, M, A + S) the actions and the states that they lead to;
     ``mask`` (B, M) is True on real frames.
     """
 
@@ -179,7 +180,9 @@ class Demonstrations:
         ValueError: labels that are not integers from 0 to the number of primitives - 1, or a primitive with no frames.
     """
 
-    def __init__(self, metadata: LeRobotDatasetMetadata, subtask_key: str, device: str, filter_frames: int = 1) -> None:
+    def __init__(
+        self, metadata: LeRobotDatasetMetadata, subtask_key: str, device: str, filters: Sequence[int] = ()
+    ) -> None:
         root = Path(metadata.root)
         columns, self.primitives = _read_columns(root, subtask_key)
         _check_labels(columns["label"], self.primitives)
@@ -205,12 +208,11 @@ class Demonstrations:
         self._episode_bounds = self._bounds(new_episode, device)  # (E, 2)
         self.longest = int((self._segment_bounds[:, 1] - self._segment_bounds[:, 0]).max())
         """Frames of the longest segment."""
-        self.filtered = self._filter(filter_frames)
-        """(N, S): the mean state of the last ``filter_frames`` frames of the episode, or of those there are."""
+        nothing = self.state.new_empty(len(self.state), 0, self.state.shape[1])
+        self.filtered = torch.stack([self._mean(frames) for frames in filters], dim=1) if filters else nothing
+        """(N, W, S): for each filter, the mean state of the last so many frames of the episode, or of those there are."""
 
-    def _filter(self, frames: int) -> Tensor:
-        if frames == 1:
-            return self.state
+    def _mean(self, frames: int) -> Tensor:
         sums = torch.cat([torch.zeros_like(self.state[:1]), self.state], dim=0).double().cumsum(0)
         last = torch.arange(len(self.state), device=self.state.device)
         first = torch.maximum(self._episode_bounds[self.episode, 0], last + 1 - frames)

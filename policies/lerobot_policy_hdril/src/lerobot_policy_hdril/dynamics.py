@@ -140,7 +140,7 @@ class PrimitiveDynamics(nn.Module):
         h = GRU(graph(s_t), 0)    [m, v] = FC([h || s_t^objects || c])    z = m + exp(v / 2) * noise
         y_i = FC([decoder_i(z) || z]) + L_i [s_t || f_t]
 
-    f_t is the mean of the last states, with ``filtered``. ``context`` c is empty for a model of one primitive, and says which
+    f_t are the ``means`` of the last states. ``context`` c is empty for a model of one primitive, and says which
     primitive it is for a model of all. L is there with ``state_skip``; with ``residual``, other maps stand in for it. Without
     ``variational`` there is no v, and z = m. With the decoder ``linear`` there is nothing but L, or the other maps.
     """
@@ -159,12 +159,12 @@ class PrimitiveDynamics(nn.Module):
         state_skip: bool,
         stride: int,
         variational: bool,
-        filtered: bool = False,
+        means: int = 0,
         residual: bool = False,
     ) -> None:
         super().__init__()
         self.out_dim = out_dim
-        seen = 2 * len(names) if filtered else len(names)
+        seen = (1 + means) * len(names)
         self.state_skip = StateSkip(seen, out_dim, steps, stride) if state_skip else None
         self.has_network = decoder != "linear"
         if not self.has_network:
@@ -202,7 +202,7 @@ class PrimitiveDynamics(nn.Module):
         """States (B, S), context (B, C) and step numbers (B, M) to a prediction, and how far the latent is from its prior.
 
         Args:
-            linear: what the linear maps see (B, S), or (B, 2 S) if ``filtered``.
+            linear: what the linear maps see: the state and ``means`` beside it, (B, S) or a multiple of S.
             samples: latents to draw and average over; 0 takes the mean latent. In training, one is drawn.
             stacked: called by :func:`predict_stacked` under vmap; leaves out the linear maps.
 

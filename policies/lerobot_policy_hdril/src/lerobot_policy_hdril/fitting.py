@@ -139,8 +139,10 @@ def noise_covariance(policy: HDRILPolicy, window: Window, seen: Tensor) -> Tenso
         return total
     generator = torch.Generator(seen.device).manual_seed(0)
     for _ in range(NOISY_COPIES):
-        noisy = policy.hand_noise([window.state, window.filtered], policy.state_std.double(), generator)
-        moved = policy.features(*noisy)[0] - seen
+        state, *means = policy.hand_noise(
+            [window.state, *window.filtered.unbind(1)], policy.state_std.double(), generator
+        )
+        moved = policy.features(state, torch.stack(means, 1) if means else window.filtered)[0] - seen
         total += moved.T @ moved
     return total / (NOISY_COPIES * len(seen))
 

@@ -84,7 +84,7 @@ class HDRILPolicy(PreTrainedPolicy):
         self._demonstrations: Demonstrations | None = None
         if dataset_meta is not None:
             config.set_dataset_feature_metadata(dataset_meta.features)
-            data = Demonstrations(dataset_meta, config.subtask_key, config.device or "cpu", config.filter_frames)
+            data = Demonstrations(dataset_meta, config.subtask_key, config.device or "cpu", config.filters)
             config.learn_primitives(data.primitives, data.longest)
             config.learn_replanning()
             self._demonstrations = data
@@ -119,7 +119,7 @@ class HDRILPolicy(PreTrainedPolicy):
                 state_skip=config.state_skip and not fused,
                 stride=max(config.trained_replan_every, 0),
                 variational=config.latent == "variational",
-                filtered=config.filter_frames > 1,
+                means=len(config.filters),
                 residual=fused,
             )
             for _ in range(models)
@@ -141,7 +141,7 @@ class HDRILPolicy(PreTrainedPolicy):
         self.frames = self.fused = None
         if fused:
             frames = self.frames = ObjectFrames(names, config.environment_names, config.action_names)
-            seen = frames.dim * (2 if config.filter_frames > 1 else 1)
+            seen = frames.dim * (1 + len(config.filters))
             starts = -(-self.capacity // self.ahead)
             self.fused = nn.ModuleList(FusedMaps(seen, frames, starts, self.ahead) for _ in config.primitives)
             self.register_buffer("feature_mean", torch.zeros(frames.dim))
@@ -276,7 +276,8 @@ class HDRILPolicy(PreTrainedPolicy):
         """Mean squared error and mean divergence of the latent, nats; ``noise`` draws that of the hands, if there is any."""
         state, filtered = window.state, window.filtered
         if self.hand_noise is not None and noise is not None:
-            state, filtered = self.hand_noise([state, filtered], self.state_std, noise)
+            state, *means = self.hand_noise([state, *filtered.unbind(1)], self.state_std, noise)
+            filtered = torch.stack(means, 1) if means else filtered
         predicted, divergence = self.predict(state, filtered, window.primitive, window.elapsed)
         difference = predicted - self.target(window)
         if self.config.robust:  # as the linear maps' fit, it is not to follow what is far off
@@ -328,15 +329,14 @@ class HDRILPolicy(PreTrainedPolicy):
         return (self.relational.encode_state(state) - self.relational.state_mean) / self.relational.state_std
 
     def linear_input(self, state: Tensor, filtered: Tensor) -> Tensor:
-        """What the linear maps see of states (B, S) and of the mean of the last ones (B, S)."""
-        given = self.dynamics_input(state)
-        return torch.cat([given, self.dynamics_input(filtered)], dim=-1) if self.config.filter_frames > 1 else given
+        """What the linear maps see of states (B, S) and of the means of the last ones (B, W, S)."""
+        return self.dynamics_input(torch.cat([state[:, None], filtered], dim=1)).flatten(1)
 
     def features(self, state: Tensor, filtered: Tensor) -> tuple[Tensor, Origins]:
-        """What the fused maps see of states (B, S) and of the mean of the last ones (B, S); and the origins (1 + F, B) of
+        """What the fused maps see of states (B, S) and of the means of the last ones (B, W, S); and the origins (1 + F, B) of
         their frames in the states."""
         assert self.frames is not None
-        given = torch.cat([state, filtered]) if self.config.filter_frames > 1 else state
+        given = torch.cat([state, *filtered.unbind(1)])
         origins = self.frames.origins(given)
         seen = (self.frames.features(given, origins) - self.feature_mean) / self.feature_std
         return torch.cat(seen.split(len(state)), dim=-1), origins[:, : len(state)]
@@ -359,7 +359,7 @@ class HDRILPolicy(PreTrainedPolicy):
 
     def predict(self, state: Tensor, filtered: Tensor, primitive: Tensor, elapsed: Tensor) -> tuple[Tensor, Tensor]:
         """Normalised actions and states (B, M, A + S), and divergence of the latent (B,), nats, from raw states (B, S) and
-        the mean of the last ones (B, S), ``elapsed`` (B,) frames into primitives (B,)."""
+        the means of the last ones (B, W, S), ``elapsed`` (B,) frames into primitives (B,)."""
         output, divergence = self._network(state, filtered, primitive, elapsed)
         if self.fused is not None:
             output = output + self._fused(state, filtered, primitive, elapsed)
@@ -479,7 +479,7 @@ class HDRILPolicy(PreTrainedPolicy):
 
     def plan(self, state: Tensor, filtered: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
         """Actions and states (B, M, A + S) of the rest of primitives (B,), ``elapsed`` (B,) frames into them; metres, unit
-        quaternions, in the world's frame. ``filtered`` (B, S) is the mean of the last states."""
+        quaternions, in the world's frame. ``filtered`` (B, W, S) are the means of the last states."""
         predicted, _ = self.predict(state, filtered, primitive, elapsed)
         plan = predicted * self.output_std + self.output_mean
         if self.relational is not None:

@@ -52,7 +52,9 @@ class PlaybackState:
     plan_start: Tensor  # (B,)
     replanned: Tensor  # (B,), whether the plan was made at this frame
     probabilities: Tensor  # (B, K), the planner's at this frame
-    recent: Tensor  # (B, n, S), the last states, `filter_frames` at most: observed, or predicted in an open loop
+    recent: (
+        Tensor  # (B, n, S), the last states, as many as the longest filter has: observed, or predicted in an open loop
+    )
     begun: Tensor  # (B, K), how often each primitive has begun
     memory: Tensor  # (1, B, H), the planner's
 
@@ -99,13 +101,15 @@ def advance(policy: Predictor, previous: PlaybackState | None, observed: Tensor)
     probabilities = choice.begin if previous is None else choice.probabilities(previous.primitive)
     recent = state[:, None]
     if previous is not None:
-        recent = torch.cat([previous.recent, recent], dim=1)[:, -policy.config.filter_frames :]
+        recent = torch.cat([previous.recent, recent], dim=1)[:, -max(policy.config.filters, default=1) :]
     begun = torch.zeros_like(choice.begin, dtype=torch.long) if previous is None else previous.begun
     begun = begun.scatter_add(1, primitive[:, None], (elapsed == 0).long()[:, None])
     replanned = elapsed == 0
     if policy.config.replan_every:
         replanned = elapsed % policy.config.replan_every == 0
-    plan, plan_start = _next_plan(policy, previous, state, recent.mean(1), primitive, elapsed, replanned)
+    means = [recent[:, -frames:].mean(1) for frames in policy.config.filters]
+    filtered = torch.stack(means, 1) if means else recent[:, :0]
+    plan, plan_start = _next_plan(policy, previous, state, filtered, primitive, elapsed, replanned)
     return PlaybackState(primitive, elapsed, plan, plan_start, replanned, probabilities, recent, begun, choice.memory)
 
 

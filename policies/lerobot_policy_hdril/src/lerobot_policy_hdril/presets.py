@@ -17,6 +17,7 @@ _SINGLE_HIDDEN, _MULTI_HIDDEN = {"none": 322, "scalar": 410}, 128
 PLAIN: dict[str, Any] = {
     "termination": "length",
     "filter_frames": 1,
+    "long_filter_frames": 1,
     "robust": False,
     "hand_noise": 0.0,
     "replan_every": 0,
@@ -53,6 +54,7 @@ def _presets() -> dict[str, dict[str, Any]]:
         "coordinates": "fused",
         "termination": "learned",
         "filter_frames": 8,
+        "long_filter_frames": 24,
         "robust": True,
         "hand_noise": 0.002,
         "replan_every": 2,
