@@ -253,9 +253,9 @@ def test_fused_predictions_that_are_damaged_on_purpose_change_in_one_primitive(
     whole, damaged = (load(tmp_path / name) for name in ("whole", "damaged"))
     seen = observation(metadata, [15])
     state = torch.cat([seen["observation.state"], seen["observation.environment_state"]], dim=-1)
-    means = state[:, None].expand(-1, len(whole.config.filters), -1)
+    state = state[:, None].expand(-1, 1 + len(whole.config.filters), -1)
     for primitive, name in enumerate(whole.config.primitives):
-        plans = [policy.plan(state, means, torch.tensor([primitive]), torch.tensor([0])) for policy in (whole, damaged)]
+        plans = [policy.plan(state, torch.tensor([primitive]), torch.tensor([0])) for policy in (whole, damaged)]
         assert torch.equal(*plans) == (name != "move")
         assert plans[1].isfinite().all()
 

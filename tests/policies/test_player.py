@@ -21,15 +21,15 @@ class Scripted:
     def __init__(self, wishes: list[list[int]], **config) -> None:
         self.config = SimpleNamespace(**{"rollout": "closed_loop", "replan_every": 0, "filters": []} | config)
         self.shortest_length, self.longest_length = torch.tensor(SHORTEST), torch.tensor(LONGEST)
-        self.wishes, self.planned_from, self.filtered = iter(wishes), [], []
+        self.wishes, self.planned_from, self.means = iter(wishes), [], []
 
     def choose(self, state, previous):
         begin = torch.nn.functional.one_hot(torch.tensor(next(self.wishes)), 3).float()
         return Choice(begin, None, torch.zeros(1, len(state), 1))
 
-    def plan(self, state, filtered, primitive, elapsed):
-        self.planned_from.append((state[:, 0].tolist(), primitive.tolist(), elapsed.tolist()))
-        self.filtered.append(filtered[:, :, 0].tolist())
+    def plan(self, seen, primitive, elapsed):
+        self.planned_from.append((seen[:, 0, 0].tolist(), primitive.tolist(), elapsed.tolist()))
+        self.means.append(seen[:, 1:, 0].tolist())
         steps = 100 * primitive[:, None] + elapsed[:, None] + torch.arange(6)
         # One action, and one number of state.
         return torch.stack([steps, steps + 0.5], dim=-1)

@@ -134,7 +134,7 @@ def test_plan_undoes_what_the_target_did(coordinates: str, metadata, monkeypatch
     policy = build(metadata, coordinates=coordinates).eval()
     window = demonstrations(policy).window(torch.tensor([0, 25, 140]), 0, 12)
     monkeypatch.setattr(policy, "predict", lambda state, *_: (policy.target(window), state.new_zeros(3)))
-    plan = policy.plan(window.state, window.filtered, window.primitive, window.elapsed)
+    plan = policy.plan(window.seen, window.primitive, window.elapsed)
     torch.testing.assert_close(plan[window.mask], window.target[window.mask], atol=1e-4, rtol=1e-4)
 
 
@@ -155,7 +155,7 @@ def test_stacked_models_are_the_separate_ones(preset: str, every: int, metadata)
     gradients = []
     for policy in (separate.eval(), stacked.eval()):
         window = demonstrations(policy).window(rows, every, policy.ahead)
-        predicted = policy.predict(window.state, window.filtered, window.primitive, window.elapsed)
+        predicted = policy.predict(window.seen, window.primitive, window.elapsed)
         policy.dynamics_loss(window)[0].backward()
         gradients.append([*predicted, *(p.grad for p in policy.dynamics.parameters() if p.grad is not None)])
     assert len(gradients[0]) == len(gradients[1]) > 10
@@ -204,7 +204,7 @@ def test_latent_is_sampled_in_training_and_steady_afterwards(metadata) -> None:
     window = demonstrations(policy).window(rows, 0, 12)
 
     def predict() -> torch.Tensor:
-        return policy.predict(window.state, window.filtered, window.primitive, window.elapsed)[0]
+        return policy.predict(window.seen, window.primitive, window.elapsed)[0]
 
     policy.train()
     assert not torch.equal(predict(), predict())
@@ -225,9 +225,9 @@ def test_prediction_is_the_mean_over_samples(metadata) -> None:
             model.latent[-1].bias[SMALL["hidden_dim"] :] = -100.0  # log variance
             torch.nn.init.normal_(model.head[-1].weight)
     window = demonstrations(policy).window(torch.tensor([0, 15]), 0, 12)
-    sampled = policy.predict(window.state, window.filtered, window.primitive, window.elapsed)[0]
+    sampled = policy.predict(window.seen, window.primitive, window.elapsed)[0]
     policy.config.samples = 0
-    mean = policy.predict(window.state, window.filtered, window.primitive, window.elapsed)[0]
+    mean = policy.predict(window.seen, window.primitive, window.elapsed)[0]
     torch.testing.assert_close(sampled, mean, atol=1e-4, rtol=1e-4)
 
 
@@ -239,7 +239,7 @@ def test_divergence_is_that_of_gaussians(metadata) -> None:
     model = policy.dynamics[0]
     model.latent.register_forward_hook(lambda module, args, out: kept.update(latent=out.detach()))
     window = demonstrations(policy).window(torch.tensor([0]), 0, 12)
-    _, divergence = policy.predict(window.state, window.filtered, window.primitive, window.elapsed)
+    _, divergence = policy.predict(window.seen, window.primitive, window.elapsed)
     mean, log_variance = kept["latent"].chunk(2, dim=-1)
     expected = kl_divergence(Normal(mean, (0.5 * log_variance).exp()), Normal(0.0, 1.0)).sum(-1)
     torch.testing.assert_close(divergence, expected)
@@ -287,9 +287,10 @@ def test_linear_maps_alone_predict_what_the_whole_does_before_its_network_learns
     assert not list(alone.dynamics.parameters())
     assert list(whole.dynamics.parameters())
     state = torch.cat([observation(metadata, [5, 40])[key] for key in (OBS_STATE, OBS_ENV_STATE)], dim=-1)
+    seen = state[:, None].expand(-1, 1 + len(alone.config.filters), -1)
     primitive, elapsed = torch.tensor([0, 2]), torch.tensor([0, 0])
-    given = alone.plan(state, state[:, None][:, :0], primitive, elapsed)
-    assert torch.equal(given, whole.plan(state, state[:, None][:, :0], primitive, elapsed))
+    given = alone.plan(seen, primitive, elapsed)
+    assert torch.equal(given, whole.plan(seen, primitive, elapsed))
     assert given.std() > 0.1
 
 

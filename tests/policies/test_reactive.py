@@ -95,7 +95,7 @@ def test_the_filters_are_means_of_the_last_states(filters: list[int]) -> None:
     policy = Scripted([[0]] * 6, replan_every=1, filters=filters)
     play(policy, 6)
     means = {3: [0.0, 0.5, 1.0, 2.0, 3.0, 4.0], 5: [0.0, 0.5, 1.0, 1.5, 2.0, 3.0]}
-    assert policy.filtered == [[[means[frames][t] for frames in filters]] for t in range(6)]
+    assert policy.means == [[[means[frames][t] for frames in filters]] for t in range(6)]
 
 
 def test_histories_say_what_played_and_what_begins(metadata) -> None:
@@ -122,17 +122,18 @@ def test_the_filters_of_the_demonstrations_are_those_of_the_policy(
     data, seen = demonstrations(policy), []
     assert policy.config.filters == expected
     plan = policy.plan
-    monkeypatch.setattr(policy, "plan", lambda *given: seen.append(given[1][0]) or plan(*given))
+    monkeypatch.setattr(policy, "plan", lambda *given: seen.append(given[0][0]) or plan(*given))
     for t in range(30):
         policy.select_action(observation(metadata, [FRAMES + t]))
         if len(seen) > t:  # a plan was made at this frame
-            torch.testing.assert_close(seen[-1], data.filtered[FRAMES + t])
+            torch.testing.assert_close(seen[-1], data.seen[FRAMES + t])
         else:
             seen.append(None)
+    assert torch.equal(data.seen[:, 0], data.state)
     for t, frames in enumerate(expected):
         for last in (0, 3, 29):
             mean = data.state[FRAMES + max(last + 1 - frames, 0) : FRAMES + last + 1].mean(0)
-            torch.testing.assert_close(data.filtered[FRAMES + last, t], mean)
+            torch.testing.assert_close(data.seen[FRAMES + last, 1 + t], mean)
 
 
 def test_a_trained_planner_goes_through_the_primitives(metadata) -> None:
@@ -251,7 +252,7 @@ def test_a_gru_step_by_step_is_the_gru() -> None:
 def test_mixed_precision_moves_a_plan_by_less_than_a_millimetre(metadata) -> None:
     policy = build(metadata, preset="hdril_reactive").eval()
     window = demonstrations(policy).window(BATCH, 2, 2)
-    seen = window.state, window.filtered, window.primitive, window.elapsed
+    seen = window.seen, window.primitive, window.elapsed
     plan = policy.plan(*seen)
     with torch.autocast("cpu", torch.bfloat16):
         coarse = policy.plan(*seen)
@@ -389,7 +390,7 @@ def test_noise_moves_the_hands_alone_and_all_states_alike() -> None:
     for columns in turns:
         states[:, columns] = turned(20_000, 1.0, generator(6)).float()
     std = torch.linspace(0.1, 1.0, 23)
-    one, same = HandNoise(names, told, 0.01)([states, states], std, generator())
+    one, same = HandNoise(names, told, 0.01)(torch.stack([states, states], dim=1), std, generator()).unbind(1)
     assert torch.equal(one, same)
     assert torch.equal(one[:, 16:], states[:, 16:])
     moved = (one - states)[:, [*openings, *places]]
@@ -509,8 +510,8 @@ def test_the_fit_bears_the_noise_that_the_option_asks_for(metadata) -> None:
     assert quiet.state_dict().keys() == noisy.state_dict().keys()
     data = demonstrations(noisy)
     window = data.window(data.replan_rows(1, torch.ones(6, dtype=torch.bool)), 1, 1)
-    window = replace(window, state=window.state.double(), filtered=window.filtered.double())
-    covariance = noise_covariance(noisy, window, noisy.features(window.state, window.filtered)[0])
+    window = replace(window, seen=window.seen.double())
+    covariance = noise_covariance(noisy, window, noisy.features(window.seen)[0])
     place = noisy.config.state_names.index("left_ee.x")
     # Of the present state, and of the means of the last ones.
     for column in place + len(noisy.feature_std) * torch.arange(3):

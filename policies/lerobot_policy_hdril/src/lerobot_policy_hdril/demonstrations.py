@@ -32,17 +32,21 @@ if TYPE_CHECKING:
 class Window:
     """The rest of a primitive from a frame on, for B samples, padded to M frames.
 
-    ``state`` (B, S) is what is seen at the start, ``filtered`` (B, W, S) the means of the last states there; ``elapsed``
-    (B,) how many frames of the primitive are over by then; ``target`` (B, M, A + S) the actions and the states that they lead to;
+    ``seen`` (B, 1 + W, S) is the state at the start, and beside it the means of the last ones; ``elapsed`` (B,) how many
+    frames of the primitive are over by then; ``target`` (B, M, A + S) the actions and the states that they lead to;
     ``mask`` (B, M) is True on real frames.
     """
 
-    state: Tensor
-    filtered: Tensor
+    seen: Tensor
     primitive: Tensor  # (B,)
     elapsed: Tensor
     target: Tensor
     mask: Tensor
+
+    @property
+    def state(self) -> Tensor:
+        """(B, S), at the start."""
+        return self.seen[:, 0]
 
 
 @dataclass(frozen=True)
@@ -208,9 +212,8 @@ class Demonstrations:
         self._episode_bounds = self._bounds(new_episode, device)  # (E, 2)
         self.longest = int((self._segment_bounds[:, 1] - self._segment_bounds[:, 0]).max())
         """Frames of the longest segment."""
-        nothing = self.state.new_empty(len(self.state), 0, self.state.shape[1])
-        self.filtered = torch.stack([self._mean(frames) for frames in filters], dim=1) if filters else nothing
-        """(N, W, S): for each filter, the mean state of the last so many frames of the episode, or of those there are."""
+        self.seen = torch.stack([self.state, *(self._mean(frames) for frames in filters)], dim=1)
+        """(N, 1 + W, S): the states, and for each filter the mean of the last so many of the episode, or of those there are."""
 
     def _mean(self, frames: int) -> Tensor:
         sums = torch.cat([torch.zeros_like(self.state[:1]), self.state], dim=0).double().cumsum(0)
@@ -272,7 +275,7 @@ class Demonstrations:
         # The last frame of an episode leads to a state that was not recorded: its own stands in.
         last = self._episode_bounds[self.episode[rows], 1][:, None] - 1
         target = torch.cat([self.action[steps], self.state[torch.minimum(steps + 1, last)]], dim=-1)
-        return Window(self.state[start], self.filtered[start], self.label[start], elapsed, target, mask)
+        return Window(self.seen[start], self.label[start], elapsed, target, mask)
 
     def history(self, rows: Tensor) -> History:
         """The whole episodes that the frames belong to."""

@@ -118,9 +118,9 @@ def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Te
     rows = demonstrations.replan_rows(policy.ahead, episodes)
     for k in range(len(maps)):
         window = _window(demonstrations, rows[demonstrations.label[rows] == k], policy.ahead, policy.ahead)
-        seen = policy.features(window.state, window.filtered)[0]
+        features = policy.features(window.seen)[0]
         cast(FusedMaps, maps[k]).fit(
-            seen,
+            features,
             torch.div(window.elapsed, policy.ahead, rounding_mode="floor"),
             frames,
             window.state,
@@ -128,30 +128,26 @@ def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Te
             window.mask,
             policy.config.ridge,
             policy.config.robust,
-            noise_covariance(policy, window, seen),
+            noise_covariance(policy, window, features),
         )
 
 
-def noise_covariance(policy: HDRILPolicy, window: Window, seen: Tensor) -> Tensor:
+def noise_covariance(policy: HDRILPolicy, window: Window, features: Tensor) -> Tensor:
     """Second moments (D, D) of how far features (N, D) of windows are moved by noise of the hands."""
-    total = seen.new_zeros(seen.shape[1], seen.shape[1])
-    if policy.hand_noise is None or not len(seen):
+    total = features.new_zeros(features.shape[1], features.shape[1])
+    if policy.hand_noise is None or not len(features):
         return total
-    generator = torch.Generator(seen.device).manual_seed(0)
+    generator = torch.Generator(features.device).manual_seed(0)
     for _ in range(NOISY_COPIES):
-        state, *means = policy.hand_noise(
-            [window.state, *window.filtered.unbind(1)], policy.state_std.double(), generator
-        )
-        moved = policy.features(state, torch.stack(means, 1) if means else window.filtered)[0] - seen
+        noisy = policy.hand_noise(window.seen, policy.state_std.double(), generator)
+        moved = policy.features(noisy)[0] - features
         total += moved.T @ moved
-    return total / (NOISY_COPIES * len(seen))
+    return total / (NOISY_COPIES * len(features))
 
 
 def _window(demonstrations: Demonstrations, rows: Tensor, stride: int, length: int) -> Window:
     window = demonstrations.window(rows, stride, length)
-    return replace(
-        window, state=window.state.double(), filtered=window.filtered.double(), target=window.target.double()
-    )
+    return replace(window, seen=window.seen.double(), target=window.target.double())
 
 
 def _fit_normalisation(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Tensor) -> None:
@@ -179,7 +175,7 @@ def _fit_state_skips(policy: HDRILPolicy, demonstrations: Demonstrations, episod
         skip = policy.model_of(k).state_skip
         assert skip is not None
         skip.fit(
-            policy.linear_input(window.state, window.filtered),
+            policy.linear_input(window.seen),
             policy.steps(window.elapsed),
             policy.target(window),
             window.mask,

@@ -42,22 +42,17 @@ class HandNoise(nn.Module):
     hands: Tensor  # (G, 7), columns of the state
     rest: Tensor  # columns of the state that actions have too, and that are no pose's
 
-    def forward(self, states: list[Tensor], std: Tensor, generator: torch.Generator) -> list[Tensor]:
-        """The states (B, S), all disturbed alike; ``std`` (S,) is their deviation over the demonstrations."""
+    def forward(self, states: Tensor, std: Tensor, generator: torch.Generator) -> Tensor:
+        """States (B, C, S), those of a row all disturbed alike; ``std`` (S,) is their deviation over the demonstrations."""
 
         def normal(*size: int) -> Tensor:
-            return torch.randn(
-                len(states[0]), *size, generator=generator, dtype=states[0].dtype, device=states[0].device
-            )
+            return torch.randn(len(states), 1, *size, generator=generator, dtype=states.dtype, device=states.device)
 
         shift = self.deviation * normal(len(self.hands), 3)
         half = 0.5 * ANGLE * self.deviation * normal(len(self.hands), 3)
         turn = unit(torch.cat([half, torch.ones_like(half[..., :1])], dim=-1))
         rest = REST * std[self.rest] * normal(len(self.rest))
-        return [self._disturb(state, shift, turn, rest) for state in states]
-
-    def _disturb(self, state: Tensor, shift: Tensor, turn: Tensor, rest: Tensor) -> Tensor:
-        poses, result = state[:, self.hands], state.clone()
-        result[:, self.hands] = torch.cat([poses[..., :3] + shift, multiply(turn, poses[..., 3:])], dim=-1)
-        result[:, self.rest] = state[:, self.rest] + rest
-        return result
+        poses, disturbed = states[..., self.hands], states.clone()  # (B, C, G, 7)
+        disturbed[..., self.hands] = torch.cat([poses[..., :3] + shift, multiply(turn, poses[..., 3:])], dim=-1)
+        disturbed[..., self.rest] = states[..., self.rest] + rest
+        return disturbed

@@ -274,11 +274,10 @@ class HDRILPolicy(PreTrainedPolicy):
 
     def dynamics_loss(self, window: Window, noise: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
         """Mean squared error and mean divergence of the latent, nats; ``noise`` draws that of the hands, if there is any."""
-        state, filtered = window.state, window.filtered
+        seen = window.seen
         if self.hand_noise is not None and noise is not None:
-            state, *means = self.hand_noise([state, *filtered.unbind(1)], self.state_std, noise)
-            filtered = torch.stack(means, 1) if means else filtered
-        predicted, divergence = self.predict(state, filtered, window.primitive, window.elapsed)
+            seen = self.hand_noise(seen, self.state_std, noise)
+        predicted, divergence = self.predict(seen, window.primitive, window.elapsed)
         difference = predicted - self.target(window)
         if self.config.robust:  # as the linear maps' fit, it is not to follow what is far off
             error = F.smooth_l1_loss(difference, torch.zeros_like(difference), reduction="none", beta=0.1)
@@ -328,28 +327,28 @@ class HDRILPolicy(PreTrainedPolicy):
             return self.normalise(state)
         return (self.relational.encode_state(state) - self.relational.state_mean) / self.relational.state_std
 
-    def linear_input(self, state: Tensor, filtered: Tensor) -> Tensor:
-        """What the linear maps see of states (B, S) and of the means of the last ones (B, W, S)."""
-        return self.dynamics_input(torch.cat([state[:, None], filtered], dim=1)).flatten(1)
+    def linear_input(self, seen: Tensor) -> Tensor:
+        """What the linear maps see of states and of the means of the last ones (B, 1 + W, S)."""
+        return self.dynamics_input(seen).flatten(1)
 
-    def features(self, state: Tensor, filtered: Tensor) -> tuple[Tensor, Origins]:
-        """What the fused maps see of states (B, S) and of the means of the last ones (B, W, S); and the origins (1 + F, B) of
+    def features(self, seen: Tensor) -> tuple[Tensor, Origins]:
+        """What the fused maps see of states and of the means of the last ones (B, 1 + W, S); and the origins (1 + F, B) of
         their frames in the states."""
         assert self.frames is not None
-        given = torch.cat([state, *filtered.unbind(1)])
+        given = seen.transpose(0, 1).flatten(0, 1)
         origins = self.frames.origins(given)
-        seen = (self.frames.features(given, origins) - self.feature_mean) / self.feature_std
-        return torch.cat(seen.split(len(state)), dim=-1), origins[:, : len(state)]
+        features = (self.frames.features(given, origins) - self.feature_mean) / self.feature_std
+        return torch.cat(features.split(len(seen)), dim=-1), origins[:, : len(seen)]
 
-    def _fused(self, state: Tensor, filtered: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
+    def _fused(self, seen: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
         """Normalised outputs (B, M, A + S) of the fused maps; 0 for the states, which they do not predict."""
         assert self.frames is not None
         assert self.fused is not None
-        (seen, origins), start = self.features(state, filtered), torch.div(elapsed, self.ahead, rounding_mode="floor")
+        (features, origins), start = self.features(seen), torch.div(elapsed, self.ahead, rounding_mode="floor")
         actions = len(self.config.action_names)
-        output = state.new_zeros(len(state), self.ahead, len(self.loss_weights))
+        output = seen.new_zeros(len(seen), self.ahead, len(self.loss_weights))
         for k, mine in _rows_by_primitive(primitive):
-            action = self.fused[k](seen[mine], start[mine], self.frames, origins[:, mine])
+            action = self.fused[k](features[mine], start[mine], self.frames, origins[:, mine])
             output[mine, :, :actions] = (action - self.output_mean[:actions]) / self.output_std[:actions]
         return output
 
@@ -357,17 +356,17 @@ class HDRILPolicy(PreTrainedPolicy):
         """The dynamics model of a primitive."""
         return cast(PrimitiveDynamics, self.dynamics[primitive if self.config.per_primitive else 0])
 
-    def predict(self, state: Tensor, filtered: Tensor, primitive: Tensor, elapsed: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised actions and states (B, M, A + S), and divergence of the latent (B,), nats, from raw states (B, S) and
-        the means of the last ones (B, W, S), ``elapsed`` (B,) frames into primitives (B,)."""
-        output, divergence = self._network(state, filtered, primitive, elapsed)
+    def predict(self, seen: Tensor, primitive: Tensor, elapsed: Tensor) -> tuple[Tensor, Tensor]:
+        """Normalised actions and states (B, M, A + S), and divergence of the latent (B,), nats, from raw states and the means of
+        the last ones (B, 1 + W, S), ``elapsed`` (B,) frames into primitives (B,)."""
+        output, divergence = self._network(seen, primitive, elapsed)
         if self.fused is not None:
-            output = output + self._fused(state, filtered, primitive, elapsed)
+            output = output + self._fused(seen, primitive, elapsed)
         return output, divergence
 
-    def _network(self, state: Tensor, filtered: Tensor, primitive: Tensor, elapsed: Tensor) -> tuple[Tensor, Tensor]:
-        normalised, samples = self.dynamics_input(state), self.config.samples
-        linear = self.linear_input(state, filtered)
+    def _network(self, seen: Tensor, primitive: Tensor, elapsed: Tensor) -> tuple[Tensor, Tensor]:
+        state, samples = seen[:, 0], self.config.samples
+        normalised, linear = self.dynamics_input(state), self.linear_input(seen)
         steps = self.steps(elapsed)
         if not self.config.per_primitive:
             context = F.one_hot(primitive, len(self.config.primitives)).to(state.dtype)
@@ -477,13 +476,13 @@ class HDRILPolicy(PreTrainedPolicy):
         answers = answers.softmax(-1)
         return Choice(answers[:, 1:], answers[:, 0], updated)
 
-    def plan(self, state: Tensor, filtered: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
+    def plan(self, seen: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
         """Actions and states (B, M, A + S) of the rest of primitives (B,), ``elapsed`` (B,) frames into them; metres, unit
-        quaternions, in the world's frame. ``filtered`` (B, W, S) are the means of the last states."""
-        predicted, _ = self.predict(state, filtered, primitive, elapsed)
+        quaternions, in the world's frame. ``seen`` (B, 1 + W, S) is the state, and the means of the last ones."""
+        predicted, _ = self.predict(seen, primitive, elapsed)
         plan = predicted * self.output_std + self.output_mean
         if self.relational is not None:
-            plan = self.relational.decode_output(plan, state)
+            plan = self.relational.decode_output(plan, seen[:, 0])
         if len(self._quaternions):
             plan[..., self._quaternions] = unit(plan[..., self._quaternions])
         return plan

@@ -22,8 +22,9 @@ class Predictor(Protocol):
         """What the planner says of states (B, S) that follow the frames of ``previous``."""
         ...
 
-    def plan(self, state: Tensor, filtered: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
-        """Actions and states (B, M, A + S) of the rest of primitives (B,), ``elapsed`` (B,) frames into them."""
+    def plan(self, seen: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
+        """Actions and states (B, M, A + S) of the rest of primitives (B,), ``elapsed`` (B,) frames into them, from states and the
+        means of the last ones (B, 1 + W, S)."""
         ...
 
 
@@ -107,9 +108,8 @@ def advance(policy: Predictor, previous: PlaybackState | None, observed: Tensor)
     replanned = elapsed == 0
     if policy.config.replan_every:
         replanned = elapsed % policy.config.replan_every == 0
-    means = [recent[:, -frames:].mean(1) for frames in policy.config.filters]
-    filtered = torch.stack(means, 1) if means else recent[:, :0]
-    plan, plan_start = _next_plan(policy, previous, state, filtered, primitive, elapsed, replanned)
+    seen = torch.stack([state, *(recent[:, -frames:].mean(1) for frames in policy.config.filters)], dim=1)
+    plan, plan_start = _next_plan(policy, previous, seen, primitive, elapsed, replanned)
     return PlaybackState(primitive, elapsed, plan, plan_start, replanned, probabilities, recent, begun, choice.memory)
 
 
@@ -130,17 +130,16 @@ def _next_primitive(policy: Predictor, previous: PlaybackState | None, choice: C
 def _next_plan(
     policy: Predictor,
     previous: PlaybackState | None,
-    state: Tensor,
-    filtered: Tensor,
+    seen: Tensor,
     primitive: Tensor,
     elapsed: Tensor,
     due: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Plans, and the frames of the primitives at which they start; new ones for the episodes that are ``due`` (B,)."""
     if previous is None or due.all():
-        return policy.plan(state, filtered, primitive, elapsed), elapsed
+        return policy.plan(seen, primitive, elapsed), elapsed
     rows = due.nonzero().squeeze(-1)
     if not len(rows):
         return previous.plan, previous.plan_start
-    plan = previous.plan.index_copy(0, rows, policy.plan(state[rows], filtered[rows], primitive[rows], elapsed[rows]))
+    plan = previous.plan.index_copy(0, rows, policy.plan(seen[rows], primitive[rows], elapsed[rows]))
     return plan, torch.where(due, elapsed, previous.plan_start)
