@@ -29,7 +29,7 @@ Termination = Literal["length", "learned"]
 _FREE = ("hidden_dim", "termination", "filter_frames", "long_filter_frames", "robust", "hand_noise", "replan_every")
 """Options that may differ from the preset's value."""
 _FILTERS = ("filter_frames", "long_filter_frames")
-"""Options that say over how many states a mean is that the linear maps see."""
+"""Options that give the lengths of the means, frames."""
 _BEFORE = PLAIN | {"coordinates": "absolute"}
 """Values of options whose default was another one, or which were not there, when a checkpoint without them was saved."""
 
@@ -64,11 +64,11 @@ class HDRILConfig(SingleFrameConfig):
     state_skip: bool = True
     """A linear map from the state to every step of the prediction, beside the network (ours)."""
     filter_frames: int = 8
-    """The linear maps see the mean of the last so many states beside the present one: observations are noisy. 1: no mean. It
-    is 1 without ``state_skip``, which has the maps."""
+    """The linear maps see the mean of the last so many states beside the present one: observations are noisy. 1: no such mean.
+    It is 1 without ``state_skip``, which has the maps."""
     long_filter_frames: int = 24
     """The same for a second mean. A short one follows what moves, a long one tells best where something rests; the fit of the
-    maps weighs them."""
+    maps weighs them. Of two that are as long, there is one."""
     robust: bool = True
     """Leave out of the linear maps' fit what is far off it, and train the network with Huber's loss: in demonstrations of
     scenes where something goes wrong, some windows show how that was mended."""
@@ -178,7 +178,7 @@ class HDRILConfig(SingleFrameConfig):
             self._apply_preset()
         if self.coordinates != "fused" and "hand_noise" not in self._given:
             self.hand_noise = 0.0
-        if not self.state_skip and self.coordinates != "fused":
+        if not self.state_skip:
             for name in _FILTERS:
                 if name not in self._given:
                     setattr(self, name, 1)
@@ -265,8 +265,8 @@ class HDRILConfig(SingleFrameConfig):
 
     @property
     def filters(self) -> list[int]:
-        """Over how many of the last states each mean is that the linear maps see."""
-        return [frames for frames in (self.filter_frames, self.long_filter_frames) if frames > 1]
+        """Lengths of the means that the linear maps see, frames; the shortest comes first."""
+        return sorted({frames for name in _FILTERS if (frames := getattr(self, name)) > 1})
 
     def set_dataset_feature_metadata(self, features: dict[str, dict[str, Any]]) -> None:
         """Learn what each number of state and action is called. LeRobot calls this when it trains.

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 class Window:
     """The rest of a primitive from a frame on, for B samples, padded to M frames.
 
-    ``seen`` (B, 1 + W, S) is the state at the start, and beside it the means of the last ones; ``elapsed`` (B,) how many
+    ``seen`` (B, 1 + W, S) is the state at the start, and beside it W means of the last ones; ``elapsed`` (B,) how many
     frames of the primitive are over by then; ``target`` (B, M, A + S) the actions and the states that they lead to;
     ``mask`` (B, M) is True on real frames.
     """
