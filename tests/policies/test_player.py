@@ -87,7 +87,7 @@ def test_open_loop_goes_on_from_the_predicted_state() -> None:
     policy = Scripted([[0]] * 3 + [[1]] * 3, rollout="open_loop")
     states = play(policy, 6)
     # The first state is seen; then each is what the plan said of the frame before.
-    assert [s.seen[0, 0].item() for s in states] == [0.0, 0.5, 1.5, 2.5, 100.5, 101.5]
+    assert [s.state[0, 0].item() for s in states] == [0.0, 0.5, 1.5, 2.5, 100.5, 101.5]
     assert policy.planned_from[1] == ([2.5], [1], [0])
 
 

@@ -180,6 +180,12 @@ class Demonstrations:
     Nothing here is learned: which episodes are learned from is known when the loader yields their frames, see
     :mod:`lerobot_policy_hdril.fitting`. Methods that fit anything therefore take a mask (E,) of episodes.
 
+    Args:
+        metadata: of the dataset.
+        subtask_key: column that labels each frame with its primitive.
+        device: where the tensors are.
+        filters: lengths of the W means of the last states that are beside each state, frames.
+
     Raises:
         ValueError: labels that are not integers from 0 to the number of primitives - 1, or a primitive with no frames.
     """

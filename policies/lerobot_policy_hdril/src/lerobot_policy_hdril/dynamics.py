@@ -23,14 +23,13 @@ def ridge_penalty(inputs: Tensor, ridge: float) -> Tensor:
     return penalty
 
 
-def solve_ridge(x: Tensor, y: Tensor, penalty: Tensor, pull: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
+def solve_ridge(x: Tensor, y: Tensor, penalty: Tensor) -> tuple[Tensor, Tensor]:
     """The map (W, D) of inputs x (N, D) to outputs y (N, W), and its leave-one-out errors (N, W).
 
-    The penalty P (D, D) draws the map towards the transpose of P^-1 ``pull`` (D, W). The error of a row, had the map been solved
-    without it, is its residual over 1 - h, with h = x (X^T X + P)^-1 x^T.
+    The error of a row, had the map been solved without it, is its residual over 1 - h, with h = x (X^T X + P)^-1 x^T.
     """
     inverse = torch.linalg.inv(x.T @ x + penalty)
-    solution = inverse @ (x.T @ y + pull)
+    solution = inverse @ (x.T @ y)
     leverage = ((x @ inverse) * x).sum(1).clamp_max(0.99)
     return solution.T, (y - x @ solution) / (1.0 - leverage)[:, None]
 
@@ -141,9 +140,9 @@ class PrimitiveDynamics(nn.Module):
         h = GRU(graph(s_t), 0)    [m, v] = FC([h || s_t^objects || c])    z = m + exp(v / 2) * noise
         y_i = FC([decoder_i(z) || z]) + L_i [s_t || f_t]
 
-    f_t are as many means of the last states as ``means`` says. ``context`` c is empty for a model of one primitive, and says which
-    primitive it is for a model of all. L is there with ``state_skip``; with ``residual``, other maps stand in for it. Without
-    ``variational`` there is no v, and z = m. With the decoder ``linear`` there is nothing but L, or the other maps.
+    f_t are as many means of the last states as ``means`` says. ``context`` c is empty for a model of one primitive, and says
+    which primitive it is for a model of all. L is there with ``state_skip``; with ``residual``, other maps stand in for it.
+    Without ``variational`` there is no v, and z = m. With the decoder ``linear`` there is nothing but L, or the other maps.
     """
 
     def __init__(

@@ -54,7 +54,7 @@ class Explanation:
 @torch.no_grad()
 def attend(policy: HDRILPolicy, playback: PlaybackState) -> Attention:
     """The attention weights for the state that was seen at the frame of the last action."""
-    seen, playing = playback.seen, playback.primitive.tolist()
+    seen, playing = playback.state, playback.primitive.tolist()
     given = policy.dynamics_input(seen)
     rows = [policy.model_of(k).graph.attention(given[i : i + 1], seen[i : i + 1]) for i, k in enumerate(playing)]
     return Attention(

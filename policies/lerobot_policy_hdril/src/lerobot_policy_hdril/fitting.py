@@ -129,7 +129,6 @@ def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Te
             policy.config.ridge,
             policy.config.robust,
             noise_covariance(policy, window, features),
-            policy.feature_std,
         )
 
 

@@ -43,10 +43,7 @@ class ObjectFrames(nn.Module):
             )
         others = [[group for group in poses if group != frame] for frame in frames]
         rest = [i for i in range(len(action_names)) if not any(i in hand for hand in hands)]
-        named = {tuple(state_names[i] for i in group): group for group in poses}
-        measured = [named.get(tuple(action_names[i] for i in hand)) for hand in hands]
-        present = [[_feature(group, f, others, len(state_names)) for group in measured] for f in range(1 + len(frames))]
-        columns = {"frames": frames, "seen": others, "hands": hands, "rest": rest, "present": present}
+        columns = {"frames": frames, "seen": others, "hands": hands, "rest": rest}
         for name, value in columns.items():
             self.register_buffer(name, torch.tensor(value, dtype=torch.long), persistent=False)
         self.seen = self.seen.reshape(len(frames), len(poses) - 1, 7)  # where an object has the only pose, too
@@ -57,7 +54,6 @@ class ObjectFrames(nn.Module):
     seen: Tensor  # (F, P - 1, 7), those of the poses that are seen from each
     hands: Tensor  # (G, 7), columns of an action
     rest: Tensor  # columns of an action that are no pose's
-    present: Tensor  # (1 + F, G, 7), columns of the features: where each hand is, from every frame; -1 if nothing tells
     world: Tensor  # (7,), its pose
 
     def origins(self, state: Tensor) -> Origins:
@@ -77,22 +73,11 @@ class ObjectFrames(nn.Module):
         return self.origins(state)[:, :, None].see(action[..., self.hands])
 
 
-def _feature(group: list[int] | None, frame: int, others: list[list[list[int]]], states: int) -> list[int]:
-    """Columns of the features that hold a pose of the state, seen from the world (0) or an object (1 and up); -1 if none do."""
-    if group is None or (frame and group not in others[frame - 1]):
-        return [-1] * 7
-    if not frame:
-        return group
-    first = states + 7 * (sum(map(len, others[: frame - 1])) + others[frame - 1].index(group))
-    return list(range(first, first + 7))
-
-
 class FusedMaps(nn.Module):
     """Linear maps from what is seen to the next actions, in every frame, and their fusion.
 
     In frame f a map predicts a hand's pose y_f; the demonstrations' leave-one-out errors of it have the covariance S_f, to which
-    noise of what is seen adds. The ridge penalty draws the map not to 0 but to a hand that stays where it is: it goes no further
-    than centimetres in the next frames. With the frame's origin t_f and rotation R_f in the world, the position is
+    noise of what is seen adds. With the frame's origin t_f and rotation R_f in the world, the position is
 
         x = (sum_f P_f)^-1 sum_f P_f (R_f y_f + t_f)        P_f = R_f S_f^-1 R_f^T
 
@@ -131,7 +116,6 @@ class FusedMaps(nn.Module):
         ridge: float,
         robust: bool,
         noise: Tensor,
-        scale: Tensor,
     ) -> None:
         """Solve the maps, in float64, see :func:`~lerobot_policy_hdril.dynamics.solve_ridge`.
 
@@ -146,18 +130,13 @@ class FusedMaps(nn.Module):
             robust: leave out windows that are far off a first fit.
             noise: covariance (D, D) of noise on the features that the maps are to bear; 0 for none. The penalty grows as if every
                 window were seen with such noise, and the covariance of a frame's errors by what the noise adds to them.
-            scale: deviations (D',) that the features of a state, the first ones, were normalised by.
         """
         for buffer, value in ((self.weight, 0.0), (self.plain, 0.0), (self.variance, 1.0)):
             buffer.fill_(value)
         self.precision.copy_(torch.eye(3).expand_as(self.precision))
         inputs = torch.cat([seen, torch.ones_like(seen[:, :1])], dim=-1).double()
         poses, rest = frames.targets(action, state).double(), action[..., frames.rest].double()
-        present = frames.features(state).double()[:, frames.present].transpose(0, 1)  # (1 + F, N, G, 7)
         least, noise = ridge_penalty(inputs, ridge), F.pad(noise.double(), (0, 1, 0, 1))
-        stay = F.one_hot(frames.present.clamp_min(0), inputs.shape[1]) * scale.double()[frames.present][..., None]
-        stay = stay * (frames.present >= 0)[..., None]  # the maps (1 + F, G, 7, D + 1) of hands that stay
-        pull = F.pad(least @ stay.flatten(0, 2).T, (rest.shape[-1], 0))
         for first in start.unique().tolist():
             rows = (start == first) & mask[:, 0]
             penalty = least + rows.sum() * noise
@@ -166,23 +145,15 @@ class FusedMaps(nn.Module):
             for step in range(mask.shape[1]):
                 here = rows & mask[:, step]
                 if here.any():
-                    y = _same_signs(poses[:, here, step], present[:, here])
-                    self._fit_step(first, step, inputs[here], y, rest[here, step], penalty, pull, noise)
+                    x, y = inputs[here], poses[:, here, step]
+                    self._fit_step(first, step, x, y, rest[here, step], penalty, noise)
 
     def _fit_step(
-        self,
-        first: int,
-        step: int,
-        x: Tensor,
-        poses: Tensor,
-        rest: Tensor,
-        penalty: Tensor,
-        pull: Tensor,
-        noise: Tensor,
+        self, first: int, step: int, x: Tensor, poses: Tensor, rest: Tensor, penalty: Tensor, noise: Tensor
     ) -> None:
         """Poses (1 + F, N, G, 7) and the rest of the actions (N, A - 7 G) from x (N, D + 1)."""
-        outputs = poses.transpose(0, 1).flatten(1)  # (N, (1 + F) G 7)
-        solution, errors = solve_ridge(x, torch.cat([rest, outputs], dim=-1), penalty, pull)
+        outputs = _same_signs(poses).transpose(0, 1).flatten(1)  # (N, (1 + F) G 7)
+        solution, errors = solve_ridge(x, torch.cat([rest, outputs], dim=-1), penalty)
         count = rest.shape[1]
         self.plain[first, step] = solution[:count].to(self.plain)
         self.weight[:, first, step] = solution[count:].unflatten(0, (len(poses), -1)).to(self.weight)
@@ -217,13 +188,10 @@ class FusedMaps(nn.Module):
         return action
 
 
-def _same_signs(poses: Tensor, present: Tensor) -> Tensor:
-    """Poses (F, N, G, 7) whose quaternions have the sign that is nearer to those of the other windows; all of a frame and hand
-    that which is nearer to those of ``present``."""
+def _same_signs(poses: Tensor) -> Tensor:
+    """Poses (F, N, G, 7) whose quaternions have the sign that is nearer to those of the other windows."""
     quaternion = _towards(poses[..., 3:], poses[:, :1, :, 3:])  # so that they have a mean
-    quaternion = _towards(quaternion, quaternion.mean(1, keepdim=True))
-    same = (quaternion * present[..., 3:]).sum((1, 3), keepdim=True)
-    return torch.cat([poses[..., :3], torch.where(same < 0, -quaternion, quaternion)], dim=-1)
+    return torch.cat([poses[..., :3], _towards(quaternion, quaternion.mean(1, keepdim=True))], dim=-1)
 
 
 def _towards(quaternion: Tensor, reference: Tensor) -> Tensor:

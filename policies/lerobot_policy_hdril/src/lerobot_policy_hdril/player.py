@@ -53,14 +53,12 @@ class PlaybackState:
     plan_start: Tensor  # (B,)
     replanned: Tensor  # (B,), whether the plan was made at this frame
     probabilities: Tensor  # (B, K), the planner's at this frame
-    recent: (
-        Tensor  # (B, n, S), the last states, as many as the longest filter has: observed, or predicted in an open loop
-    )
+    recent: Tensor  # (B, n, S), the last states, no more than the filters need: observed, or predicted in an open loop
     begun: Tensor  # (B, K), how often each primitive has begun
     memory: Tensor  # (1, B, H), the planner's
 
     @property
-    def seen(self) -> Tensor:
+    def state(self) -> Tensor:
         """(B, S), the state at this frame."""
         return self.recent[:, -1]
 
