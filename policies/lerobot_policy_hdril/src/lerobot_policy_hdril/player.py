@@ -106,8 +106,7 @@ def advance(policy: Predictor, previous: PlaybackState | None, observed: Tensor)
     replanned = elapsed == 0
     if policy.config.replan_every:
         replanned = elapsed % policy.config.replan_every == 0
-    seen = torch.stack([state, *(recent[:, -frames:].mean(1) for frames in policy.config.filters)], dim=1)
-    plan, plan_start = _next_plan(policy, previous, seen, primitive, elapsed, replanned)
+    plan, plan_start = _next_plan(policy, previous, recent, primitive, elapsed, replanned)
     return PlaybackState(primitive, elapsed, plan, plan_start, replanned, probabilities, recent, begun, choice.memory)
 
 
@@ -128,16 +127,21 @@ def _next_primitive(policy: Predictor, previous: PlaybackState | None, choice: C
 def _next_plan(
     policy: Predictor,
     previous: PlaybackState | None,
-    seen: Tensor,
+    recent: Tensor,
     primitive: Tensor,
     elapsed: Tensor,
     due: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Plans, and the frames of the primitives at which they start; new ones for the episodes that are ``due`` (B,)."""
     if previous is None or due.all():
-        return policy.plan(seen, primitive, elapsed), elapsed
+        return policy.plan(_seen(policy, recent), primitive, elapsed), elapsed
     rows = due.nonzero().squeeze(-1)
     if not len(rows):
         return previous.plan, previous.plan_start
-    plan = previous.plan.index_copy(0, rows, policy.plan(seen[rows], primitive[rows], elapsed[rows]))
-    return plan, torch.where(due, elapsed, previous.plan_start)
+    made = policy.plan(_seen(policy, recent[rows]), primitive[rows], elapsed[rows])
+    return previous.plan.index_copy(0, rows, made), torch.where(due, elapsed, previous.plan_start)
+
+
+def _seen(policy: Predictor, recent: Tensor) -> Tensor:
+    """The last of states (B, n, S), and the means of the last ones (B, 1 + W, S)."""
+    return torch.stack([recent[:, -1], *(recent[:, -frames:].mean(1) for frames in policy.config.filters)], dim=1)
