@@ -15,7 +15,8 @@ from lerobot_policy_hdril.coordinates import Origins, multiply, positive
 from lerobot_policy_hdril.decoders import run_gru
 from lerobot_policy_hdril.dynamics import StateSkip, ridge_penalty, solve_ridge, usual_windows
 from lerobot_policy_hdril.fitting import noise_covariance
-from lerobot_policy_hdril.fusion import FusedMaps, ObjectFrames
+from lerobot_policy_hdril.fusion import HAND as HAND_OWNER
+from lerobot_policy_hdril.fusion import NO_POSE, FusedMaps, ObjectFrames
 from lerobot_policy_hdril.graph import pose_groups
 from lerobot_policy_hdril.hand_noise import ANGLE, REST, HandNoise
 from lerobot_policy_hdril.player import Choice
@@ -31,6 +32,7 @@ POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 HAND, CUP, SHELF = ([f"{name}.{axis}" for axis in POSE] for name in ("left_ee", "cup", "shelf"))
 STATE = [*HAND, *CUP, *SHELF, "cup.size"]
 ACTION = [*HAND, "left_gripper.pos"]
+LEAST = (1e-6, 1.0, 1.0)  # a penalty that hardly matters, on all alike
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -159,12 +161,9 @@ def test_the_maps_see_the_state_first_and_then_each_mean(values: dict[str, Any],
         skip.weight[..., len(parts[0][0]) :] = 0.0
         assert torch.equal(policy.plan(other, primitive, elapsed), policy.plan(seen, primitive, elapsed))
         return
-    told, origins = policy.features(seen)
+    told, size = policy.features(seen)[0] * policy.feature_std + policy.feature_mean, len(parts[0][0])
     for i, part in enumerate(parts):
-        expected = (policy.frames.features(part) - policy.feature_mean) / policy.feature_std
-        torch.testing.assert_close(told[:, i * policy.frames.dim : (i + 1) * policy.frames.dim], expected)
-    for field in ("position", "rotation"):
-        torch.testing.assert_close(getattr(origins, field), getattr(policy.frames.origins(parts[0]), field))
+        torch.testing.assert_close(told[:, i * size : (i + 1) * size], part)
     network = [policy._network(given, primitive, elapsed)[0] for given in (seen, other)]
     assert torch.equal(*network)
 
@@ -247,13 +246,13 @@ def test_poses_are_seen_from_a_frame_and_placed_by_it() -> None:
 def test_an_object_may_have_the_only_pose() -> None:
     frames = ObjectFrames(["left.joint", *CUP], CUP, ACTION).double()
     states = torch.cat([torch.rand(5, 1).double(), scenes(5, 0)[:, :7]], dim=-1)
-    torch.testing.assert_close(frames.features(states), states)
+    torch.testing.assert_close(frames.features(states[:, None]), states)
     assert frames.dim == 8
 
 
 def test_each_step_of_a_plan_has_maps_of_its_own_by_where_the_plan_starts() -> None:
     frames, states = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION).double(), scenes(400, 2)
-    maps, start = FusedMaps(frames.dim, frames, 2, 2).double(), torch.arange(400) % 2
+    maps, start = FusedMaps(frames, 2, 2).double(), torch.arange(400) % 2
 
     def actions(states: Tensor, start: Tensor) -> Tensor:
         """The hand is by the cup, 10 cm further along its axis at each step, and 40 cm in plans that start later."""
@@ -264,9 +263,10 @@ def test_each_step_of_a_plan_has_maps_of_its_own_by_where_the_plan_starts() -> N
 
     noise = torch.zeros(frames.dim, frames.dim)
     mask = torch.ones(400, 2, dtype=torch.bool)
-    maps.fit(frames.features(states), start, frames, states, actions(states, start), mask, 1e-6, False, noise)
+    seen = states[:, None]
+    maps.fit(frames.features(seen), start, frames, seen, actions(states, start), mask, LEAST, False, noise)
     states, start = scenes(20, 3), torch.arange(20) // 3 % 2
-    told = maps(frames.features(states), start, frames, frames.origins(states))
+    told = maps(frames.features(states[:, None]), start, frames, frames.origins(states[:, None]))
     torch.testing.assert_close(told[..., :3], actions(states, start)[..., :3], atol=2e-3, rtol=0)
 
 
@@ -300,21 +300,145 @@ def test_what_objects_see_does_not_change_when_the_world_is_moved() -> None:
         moved[:, pose[:3]] = torch.from_numpy(turn.apply(states[:, pose[:3]])) + shift
         moved[:, pose[3:]] = torch.from_numpy((turn * rotations(states[:, pose[3:]])).as_quat())
     moved[1::2, 10:14] *= -1.0  # the same rotation
-    before, after = frames.features(states), frames.features(moved)
+    before, after = frames.features(states[:, None]), frames.features(moved[:, None])
     assert before.shape == (5, frames.dim) == (5, 22 + 2 * 2 * 7)
     torch.testing.assert_close(after[:, 22:], before[:, 22:])
     torch.testing.assert_close(before[:, :22], states)
 
 
+def views(count: int, seed: int) -> Tensor:
+    """Three states (count, 3, 22), as a state and two means of others."""
+    return torch.stack([scenes(count, seed + i) for i in range(3)], dim=1)
+
+
+def pose_seen_from(frame: Tensor, pose: Tensor) -> Tensor:
+    """Poses (N, 7) from frames (N, 7), w >= 0."""
+    turn = rotations(frame[:, 3:]).inv()
+    place = turn.apply(pose[:, :3] - frame[:, :3])
+    quaternion = (turn * rotations(pose[:, 3:])).as_quat(canonical=True)
+    return torch.cat([torch.from_numpy(place), torch.from_numpy(quaternion)], dim=-1)
+
+
+def columns_of(frames: ObjectFrames, **wanted: int) -> list[int]:
+    """Features of which all this is true."""
+    here = torch.ones(frames.dim, dtype=torch.bool)
+    for name, value in wanted.items():
+        here &= getattr(frames, name) == value
+    return here.nonzero().flatten().tolist()
+
+
+def test_an_object_gives_a_frame_in_every_view_and_sees_the_hands_as_they_are_now() -> None:
+    frames, seen = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION, 3).double(), views(5, 20)
+    told, places = frames.features(seen), {HAND_OWNER: HAND, 0: CUP, 1: SHELF}
+    assert told.shape == (5, frames.dim)
+    columns = {owner: [STATE.index(name) for name in names] for owner, names in places.items()}
+    found = columns_of(frames, seen_from=0)
+    for view in range(3):
+        for frame in range(2):
+            origin, number = seen[:, view, columns[frame]], 1 + 2 * view + frame
+            looked = {(HAND_OWNER, 0), (HAND_OWNER, view), (1 - frame, view)}
+            for owner, of in looked:
+                here = columns_of(frames, seen_from=number, view=of, owner=owner)
+                torch.testing.assert_close(told[:, here], pose_seen_from(origin, seen[:, of, columns[owner]]))
+                found += here
+            origins = frames.origins(seen)[number]
+            torch.testing.assert_close(origins.position, origin[:, :3])
+            torch.testing.assert_close(origins.rotation, torch.from_numpy(rotations(origin[:, 3:]).as_matrix()))
+    assert sorted(found) == list(range(frames.dim))
+
+
+def test_a_feature_is_like_that_of_a_single_view() -> None:
+    frames, states = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION, 3).double(), scenes(5, 0)
+    still = states[:, None].expand(5, 3, 22)
+    torch.testing.assert_close(frames.single(states)[:, frames.alike], frames.features(still))
+
+
+@pytest.mark.parametrize("moved", [(), ("cup",), ("cup", "shelf")])
+def test_a_map_sees_most_freely_what_its_frame_shows(moved: tuple[str, ...]) -> None:
+    """Feature by feature, what the docstring says."""
+    names, things = [*STATE, "left_gripper.pos", "goal.x"], ["cup", "shelf"]
+    frames = ObjectFrames(names, [*CUP, *SHELF, "cup.size", "goal.x"], ACTION, 2).double()
+    penalties = frames.penalties(torch.tensor([name in moved for name in things]), 30.0, 300.0)
+    owners = {HAND_OWNER: "left", 0: "cup", 1: "shelf", NO_POSE: "goal"}
+    for number, row in enumerate(penalties.tolist()):
+        view, own = (0, "") if not number else divmod(number - 1, 2)
+        own = own if own == "" else things[int(own)]
+        for column, penalty in enumerate(row):
+            owner, of = owners[int(frames.owner[column])], int(frames.view[column])
+            here, is_pose = int(frames.seen_from[column]) == number, bool(frames.of_pose[column])
+            if not is_pose:
+                light = of == 0 and owner in ("left", "goal", own, *moved)
+                expected = 1.0 if light else 300.0
+            elif owner == "left" and of == 0:
+                expected = 1.0 if here else 30.0 if int(frames.seen_from[column]) == 0 else 300.0
+            elif owner == "left":
+                expected = 1.0 if here and of == view and moved else 300.0
+            else:
+                expected = 300.0 if not here or of != view else 1.0 if owner in moved else 30.0
+            assert penalty == expected, (number, column)
+
+
+def test_what_has_moved_is_far_from_its_longest_mean_in_most_demonstrations() -> None:
+    frames, still = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION, 3).double(), scenes(9, 0)
+    seen = still[:, None].repeat(1, 3, 1)
+    assert frames.moved(seen).tolist() == [False, False]
+    seen[:5, 2, STATE.index("shelf.y")] += 0.031
+    seen[:4, 2, STATE.index("cup.x")] -= 0.5
+    seen[:, 1, STATE.index("cup.x")] += 0.5  # a shorter mean
+    assert frames.moved(seen).tolist() == [False, True]
+
+
+@pytest.mark.parametrize(("late", "alone"), [(50, True), (49, False)])
+def test_a_start_that_few_executions_reach_has_the_maps_of_the_one_before(late: int, alone: bool) -> None:
+    frames = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION).double()
+    maps, seen = FusedMaps(frames, 4, 1).double(), scenes(200 + late, 2)[:, None]
+    start = torch.tensor([0] * 100 + [1] * 100 + [2] * late)
+    action = torch.cat([at_cup(seen[:, 0]), 0.1 * start[:, None].double()], dim=-1)[:, None]
+    mask, noise = torch.ones(len(seen), 1, dtype=torch.bool), torch.zeros(frames.dim, frames.dim)
+    maps.fit(frames.features(seen), start, frames, seen, action, mask, LEAST, False, noise)
+    told = [maps(frames.features(seen), torch.full_like(start, s), frames, frames.origins(seen)) for s in range(4)]
+    openings = [float(part[..., 7].mean()) for part in told]
+    assert openings[:2] == pytest.approx([0.0, 0.1 if alone else 0.1 + 0.1 * late / (100 + late)], abs=0.01)
+    assert (openings[2] == pytest.approx(0.2, abs=0.01)) is alone
+    assert torch.equal(told[2], told[3])
+    assert torch.equal(told[1], told[2]) is not alone
+
+
+def test_from_few_demonstrations_it_helps_to_know_what_a_frame_sees() -> None:
+    """The hand is to go half of the way to the cup's side; what is seen from elsewhere says nothing."""
+    frames, noise = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION, 3).double(), 2e-3
+
+    def errors(ridge: tuple[float, float, float]) -> Tensor:
+        maps, train, test = FusedMaps(frames, 1, 1).double(), views(20, 40), views(200, 60)
+
+        def told(seen: Tensor) -> Tensor:
+            goal = at_cup(seen[:, 0])
+            goal[:, :3] = 0.5 * goal[:, :3] + 0.5 * seen[:, 0, :3]
+            return goal
+
+        action = torch.cat([told(train), torch.zeros(20, 1).double()], dim=-1)[:, None]
+        action[..., :3] += noise * torch.randn(20, 1, 3, generator=generator(9))
+        features = [frames.features(seen) for seen in (train, test)]
+        mean, std = features[0].mean(0), features[0].std(0)
+        inputs = [(part - mean) / std for part in features]
+        start, mask = torch.zeros(20, dtype=torch.long), torch.ones(20, 1, dtype=torch.bool)
+        nothing = torch.zeros(frames.dim, frames.dim)
+        maps.fit(inputs[0], start, frames, train, action, mask, ridge, False, nothing)
+        given = maps(inputs[1], torch.zeros(200, dtype=torch.long), frames, frames.origins(test))
+        return (given[:, 0, :3] - told(test)[:, :3]).norm(dim=-1).mean()
+
+    assert errors((0.1, 30.0, 300.0)) < 0.5 * errors((0.1, 1.0, 1.0))
+
+
 def fitted(target: Any, count: int = 300) -> tuple[FusedMaps, ObjectFrames]:
     """Maps that were fitted to actions ``target(state)`` (N, 7) and a hand that is open by the cup's size."""
     frames = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION).double()
-    maps, states = FusedMaps(frames.dim, frames, 1, 1).double(), scenes(count, 2)
+    maps, states = FusedMaps(frames, 1, 1).double(), scenes(count, 2)
     action = torch.cat([target(states), states[:, -1:]], dim=-1)[:, None]
     mask = torch.ones(count, 1, dtype=torch.bool)
     start = torch.zeros(count, dtype=torch.long)
-    seen = frames.features(states)
-    maps.fit(seen, start, frames, states, action, mask, 1e-6, False, torch.zeros(frames.dim, frames.dim))
+    seen, noise = states[:, None], torch.zeros(frames.dim, frames.dim)
+    maps.fit(frames.features(seen), start, frames, seen, action, mask, LEAST, False, noise)
     return maps, frames
 
 
@@ -333,7 +457,8 @@ def at_place(states: Tensor) -> Tensor:
 def test_the_frame_in_which_demonstrations_agree_decides(target: Any, best: int) -> None:
     maps, frames = fitted(target)
     states = scenes(20, 3)
-    action = maps(frames.features(states), torch.zeros(20, dtype=torch.long), frames, frames.origins(states))[:, 0]
+    seen = states[:, None]
+    action = maps(frames.features(seen), torch.zeros(20, dtype=torch.long), frames, frames.origins(seen))[:, 0]
     expected = target(states)
     torch.testing.assert_close(action[:, :3], expected[:, :3], atol=2e-3, rtol=0)
     dot = (action[:, 3:7] * expected[:, 3:]).sum(-1).abs()
@@ -353,7 +478,7 @@ def test_predictions_are_weighted_by_their_precision(dtype: torch.dtype) -> None
     for frame, variances in enumerate(spread):
         turn = torch.linalg.qr(torch.randn(3, 3, generator=draw).double()).Q
         maps.precision[frame] = turn @ torch.diag(1.0 / variances) @ turn.T
-    seen = torch.cat([frames.features(states), torch.ones(20, 1).double()], dim=-1)
+    seen = torch.cat([frames.features(states[:, None]), torch.ones(20, 1).double()], dim=-1)
     expected = []
     for row in range(20):
         total, weighted = torch.zeros(3, 3).double(), torch.zeros(3).double()
@@ -368,7 +493,7 @@ def test_predictions_are_weighted_by_their_precision(dtype: torch.dtype) -> None
             total, weighted = total + precision, weighted + precision @ told
         expected.append(torch.linalg.solve(total, weighted))
     maps, frames = maps.to(dtype), frames.to(dtype)
-    given = states.to(dtype)
+    given = states[:, None].to(dtype)
     action = maps(frames.features(given), torch.zeros(20, dtype=torch.long), frames, frames.origins(given))[:, 0]
     tolerance = 1e-4 if dtype == torch.float32 else 1e-9
     torch.testing.assert_close(action[:, :3].double(), torch.stack(expected), atol=tolerance, rtol=0)
@@ -444,7 +569,7 @@ def following(noise: float) -> tuple[FusedMaps, Tensor, Tensor, Tensor]:
 
     With them, what was seen, the hand's pose in the action, and the covariance of the noise."""
     frames, draw = ObjectFrames([*STATE, "left_gripper.pos"], [*CUP, *SHELF, "cup.size"], ACTION).double(), generator(6)
-    maps, states = FusedMaps(frames.dim, frames, 1, 1).double(), scenes(400, 2)
+    maps, states = FusedMaps(frames, 1, 1).double(), scenes(400, 2)
     target = at_cup(states)
     opening = 1.0 + 1e-3 * torch.randn(400, 1, generator=draw).double()
     action = torch.cat([target, 1.0 + 2.0 * (opening - 1.0)], dim=-1)[:, None]
@@ -454,9 +579,9 @@ def following(noise: float) -> tuple[FusedMaps, Tensor, Tensor, Tensor]:
     deviations = torch.zeros(frames.dim).double()
     deviations[:7], deviations[22] = noise, 20.0 * noise
     start, mask = torch.zeros(400, dtype=torch.long), torch.ones(400, 1, dtype=torch.bool)
-    seen, covariance = frames.features(states), torch.diag(deviations.square())
+    seen, covariance = frames.features(states[:, None]), torch.diag(deviations.square())
     seen[:, 23:] = 0.0  # the world's coordinates alone, so that one number is one way to follow
-    maps.fit(seen, start, frames, states, action, mask, 1e-6, False, covariance)
+    maps.fit(seen, start, frames, states[:, None], action, mask, LEAST, False, covariance)
     return maps, seen, target, covariance
 
 
@@ -547,8 +672,8 @@ def test_the_fit_bears_the_noise_that_the_option_asks_for(metadata) -> None:
     covariance = noise_covariance(noisy, window, noisy.features(window.seen)[0])
     place = noisy.config.state_names.index("left_ee.x")
     # Of the present state, and of the means of the last ones.
-    for column in place + len(noisy.feature_std) * torch.arange(3):
-        expected = (0.002 / noisy.feature_std[place].double()) ** 2
+    for column in place + len(noisy.state_std) * torch.arange(3):
+        expected = (0.005 / noisy.feature_std[place].double()) ** 2
         torch.testing.assert_close(covariance[column, column], expected, rtol=0.15, atol=0)
     table = noisy.config.environment_names.index("table.x") + len(noisy.config.state_names)
     assert covariance[table, table] == 0.0

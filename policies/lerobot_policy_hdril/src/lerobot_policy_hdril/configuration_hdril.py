@@ -30,6 +30,7 @@ _FREE = ("hidden_dim", "termination", "filter_frames", "long_filter_frames", "ro
 """Options that may differ from the preset's value."""
 _FILTERS = ("filter_frames", "long_filter_frames")
 """Options that give the lengths of the means, frames."""
+_RIDGES = ("ridge", "ridge_still", "ridge_other")
 _BEFORE = PLAIN | {"coordinates": "absolute"}
 """Values of options whose default was another one, or which were not there, when a checkpoint without them was saved."""
 
@@ -72,7 +73,7 @@ class HDRILConfig(SingleFrameConfig):
     robust: bool = True
     """Leave out of the linear maps' fit what is far off it, and train the network with Huber's loss: in demonstrations of
     scenes where something goes wrong, some windows show how that was mended."""
-    hand_noise: float = 0.002
+    hand_noise: float = 0.005
     """Deviation, m, by which the measured hands are disturbed when the dynamics learn, so that they do not learn to follow
     themselves; 0: not at all. Rotations are disturbed in proportion. Numbers that actions have by the same name and that
     are no pose, such as an opening, are disturbed by half their deviation whatever the value, see
@@ -120,6 +121,12 @@ class HDRILConfig(SingleFrameConfig):
     """Weight of the predicted states beside that of the actions."""
     ridge: float = 1.0
     """Penalty on the squared weights of the linear maps (``state_skip``), which are solved, not trained."""
+    ridge_still: float = 30.0
+    """For ``coordinates=fused``: how many times as heavy the penalty is on what stands still, as it is seen from a frame, and on
+    where the hands are in the world. The hands and what is carried have the penalty ``ridge``."""
+    ridge_other: float = 300.0
+    """For ``coordinates=fused``: the same for all that is not seen from the frame. A few demonstrations cannot tell which of some
+    hundred numbers matter."""
     min_std: float = 0.01
     """Floor of the deviations that normalise the data, m or dimensionless: numbers that hardly vary must not dominate."""
 
@@ -192,8 +199,9 @@ class HDRILConfig(SingleFrameConfig):
         for name in ("hidden_dim", "node_dim", "planner_hidden_dim", "planner_batch_size", *_FILTERS):
             if getattr(self, name) < 1:
                 raise ValueError(f"policy.{name} must be at least 1, got {getattr(self, name)}")
-        if self.ridge <= 0:
-            raise ValueError(f"policy.ridge must be above 0, got {self.ridge}")
+        for name in _RIDGES:
+            if getattr(self, name) <= 0:
+                raise ValueError(f"policy.{name} must be above 0, got {getattr(self, name)}")
         if self.kl_weight < 0 or self.samples < 0:
             raise ValueError(
                 f"policy.kl_weight and policy.samples must not be negative, got {self.kl_weight} and {self.samples}"
@@ -246,6 +254,11 @@ class HDRILConfig(SingleFrameConfig):
             for name, value in _BEFORE.items():
                 if name not in self._given:
                     setattr(self, name, value)
+            if self.coordinates == "fused" and "ridge_other" not in self._given:
+                raise ValueError(
+                    "the checkpoint has policy.coordinates=fused of a version in which the maps of every frame saw all alike: "
+                    "train it anew, or run it with the version that saved it"
+                )
         if self.primitive_lengths and not self.capacity:
             self.capacity = max(longest for _, longest in self.primitive_lengths)
         if self.primitive_lengths and not self.training_data:

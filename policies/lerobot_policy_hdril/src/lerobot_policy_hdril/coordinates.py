@@ -29,13 +29,18 @@ _TURNS = torch.tensor([False] * 3 + [True] * 4)  # which numbers of a pose are i
 
 def multiply(a: Tensor, b: Tensor) -> Tensor:
     """Products (..., 4) of quaternions, xyzw: first b, then a."""
-    return _apply(a[..., _NUMBERS] * _LEFT_SIGNS.to(a), b)
+    return apply(a[..., _NUMBERS] * _LEFT_SIGNS.to(a), b)
 
 
-def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
+def apply(matrix: Tensor, vector: Tensor) -> Tensor:
     """Products (..., n) of matrices (..., n, n) and vectors (..., n), as exact as sums: mixed precision and TF32 change matrix
     products, and a pose would lose millimetres."""
     return (matrix * vector[..., None, :]).sum(-1)
+
+
+def product(a: Tensor, b: Tensor) -> Tensor:
+    """Products (..., n, n) of matrices, as exact as :func:`apply`."""
+    return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
 
 
 def positive(poses: Tensor) -> Tensor:
@@ -57,7 +62,7 @@ class Origins:
         """Frames at positions (..., 3), turned by unit quaternions (..., 4), xyzw."""
         numbers = quaternion[..., _NUMBERS]
         left, right = numbers * _LEFT_SIGNS.to(numbers), numbers[..., :3, :] * _RIGHT_SIGNS.to(numbers)
-        rotation = _apply(right[..., None, :, :], left[..., :3, :])  # q v q* = L(q) R(q)^T v
+        rotation = apply(right[..., None, :, :], left[..., :3, :])  # q v q* = L(q) R(q)^T v
         return cls(position, rotation, left)
 
     def __getitem__(self, index: Any) -> Origins:
@@ -67,12 +72,12 @@ class Origins:
         """Poses (..., P, 7) of the world, P for each frame, as seen from the frames."""
         offset = poses[..., :3] - self.position[..., None, :]
         rotation, left = self.rotation.mT[..., None, :, :], self.left.mT[..., None, :, :]
-        return torch.cat([_apply(rotation, offset), _apply(left, poses[..., 3:])], dim=-1)
+        return torch.cat([apply(rotation, offset), apply(left, poses[..., 3:])], dim=-1)
 
     def place(self, seen: Tensor) -> Tensor:
         """The inverse of :meth:`see`."""
-        position = _apply(self.rotation[..., None, :, :], seen[..., :3]) + self.position[..., None, :]
-        return torch.cat([position, _apply(self.left[..., None, :, :], seen[..., 3:])], dim=-1)
+        position = apply(self.rotation[..., None, :, :], seen[..., :3]) + self.position[..., None, :]
+        return torch.cat([position, apply(self.left[..., None, :, :], seen[..., 3:])], dim=-1)
 
 
 class RelationalCoordinates(nn.Module):

@@ -24,14 +24,15 @@ def ridge_penalty(inputs: Tensor, ridge: float) -> Tensor:
 
 
 def solve_ridge(x: Tensor, y: Tensor, penalty: Tensor) -> tuple[Tensor, Tensor]:
-    """The map (W, D) of inputs x (N, D) to outputs y (N, W), and its leave-one-out errors (N, W).
+    """The maps (..., W, D) of inputs x (N, D) to outputs y (..., N, W), with penalties (..., D, D), and their leave-one-out errors
+    (..., N, W).
 
     The error of a row, had the map been solved without it, is its residual over 1 - h, with h = x (X^T X + P)^-1 x^T.
     """
-    inverse = torch.linalg.inv(x.T @ x + penalty)
-    solution = inverse @ (x.T @ y)
-    leverage = ((x @ inverse) * x).sum(1).clamp_max(0.99)
-    return solution.T, (y - x @ solution) / (1.0 - leverage)[:, None]
+    factor = torch.linalg.cholesky(x.T @ x + penalty)
+    solution = torch.cholesky_solve(x.T @ y, factor)
+    leverage = torch.linalg.solve_triangular(factor, x.T, upper=False).square().sum(-2).clamp_max(0.99)
+    return solution.mT, (y - x @ solution) / (1.0 - leverage)[..., None]
 
 
 def usual_windows(x: Tensor, y: Tensor, rows: Tensor, penalty: Tensor) -> Tensor:

@@ -109,12 +109,12 @@ def fit(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Tensor) -
 
 def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Tensor) -> None:
     """Solve the maps in every frame on all windows that training can draw."""
-    frames, maps, actions = policy.frames, policy.fused, len(policy.config.action_names)
+    frames, maps, config = policy.frames, policy.fused, policy.config
     assert frames is not None
     assert maps is not None
-    seen = frames.features(demonstrations.state[episodes[demonstrations.episode]].double())
-    policy.feature_mean.copy_(seen.mean(0))
-    policy.feature_std.copy_(seen.std(0, correction=0).clamp_min(policy.config.min_std))
+    single = frames.single(demonstrations.state[episodes[demonstrations.episode]].double())
+    policy.feature_mean.copy_(single.mean(0)[frames.alike])
+    policy.feature_std.copy_(single.std(0, correction=0).clamp_min(config.min_std)[frames.alike])
     rows = demonstrations.replan_rows(policy.ahead, episodes)
     for k in range(len(maps)):
         window = _window(demonstrations, rows[demonstrations.label[rows] == k], policy.ahead, policy.ahead)
@@ -123,11 +123,11 @@ def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Te
             features,
             torch.div(window.elapsed, policy.ahead, rounding_mode="floor"),
             frames,
-            window.state,
-            window.target[..., :actions],
+            window.seen,
+            window.target[..., : len(config.action_names)],
             window.mask,
-            policy.config.ridge,
-            policy.config.robust,
+            (config.ridge, config.ridge_still, config.ridge_other),
+            config.robust,
             noise_covariance(policy, window, features),
         )
 

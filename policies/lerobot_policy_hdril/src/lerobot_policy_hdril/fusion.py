@@ -4,35 +4,50 @@ A movement is often simple in the frame of the object that it is about: a grasp 
 that is. Which object counts, and when, is learned: the frame in which demonstrations agree predicts with little variance, and
 weighs most. Source of the idea: task-parameterised Gaussian mixtures (Calinon, A tutorial on task-parameterized movement
 learning and retrieval, 2016). Here the Gaussian of each frame comes from a linear map of what is seen.
+
+From a frame, little matters: where the hands are, as seen from there, and what is carried. A few demonstrations cannot tell
+that from some hundred numbers. So the maps are told: the ridge penalty of a frame's map is light on what is seen from that
+frame, and heavy on all else.
 """
 
 from __future__ import annotations
+
+from itertools import groupby
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lerobot_policy_hdril.coordinates import Origins, positive, unit
+from lerobot_policy_hdril.coordinates import Origins, apply, positive, product, unit
 from lerobot_policy_hdril.dynamics import ridge_penalty, solve_ridge, usual_windows
-from lerobot_policy_hdril.graph import pose_groups
+from lerobot_policy_hdril.graph import node_of, pose_groups
 
 _FLOOR = 1e-7
 """Least variance, m² and of a quaternion's numbers: no frame is trusted further than a third of a millimetre."""
+MOVED = 0.03
+"""Distance from its longest mean, m, at which an object counts as just moved, in the median of the demonstrations."""
+SUPPORT = 0.5
+"""Share of a primitive's executions that must reach a start for it to have maps of its own."""
+HAND, NO_POSE = -1, -2  # owners of numbers that are no object's with a pose
 
 
 class ObjectFrames(nn.Module):
     """Poses of a state as they are seen from the world and from every object with a pose.
 
+    Beside the state there are means of the last ones: views, and the state is view 0. An object gives a frame in each view, where
+    it stands in that. What is seen from there is what the view shows, and the hands as they are now.
+
     Args:
         state_names: names of the state's numbers, hands and objects.
         objects: which of them are objects'.
         action_names: names of an action's numbers.
+        views: the state, and how many means are beside it.
 
     Raises:
         ValueError: no object has a pose, or the actions have none.
     """
 
-    def __init__(self, state_names: list[str], objects: list[str], action_names: list[str]) -> None:
+    def __init__(self, state_names: list[str], objects: list[str], action_names: list[str], views: int = 1) -> None:
         super().__init__()
         poses, hands = pose_groups(state_names), pose_groups(action_names)
         frames = [group for group in poses if state_names[group[0]] in objects]
@@ -41,36 +56,120 @@ class ObjectFrames(nn.Module):
                 "policy.coordinates=fused needs poses of objects and poses in the actions; "
                 f"objects: {', '.join(objects)}; actions: {', '.join(action_names)}. policy.preset=hdril needs none"
             )
-        others = [[group for group in poses if group != frame] for frame in frames]
         rest = [i for i in range(len(action_names)) if not any(i in hand for hand in hands)]
-        columns = {"frames": frames, "seen": others, "hands": hands, "rest": rest}
+        columns = {"objects": frames, "hands": hands, "rest": rest}
         for name, value in columns.items():
             self.register_buffer(name, torch.tensor(value, dtype=torch.long), persistent=False)
-        self.seen = self.seen.reshape(len(frames), len(poses) - 1, 7)  # where an object has the only pose, too
         self.register_buffer("world", torch.eye(7)[6], persistent=False)
-        self.dim = len(state_names) + 7 * sum(map(len, others))
+        self.views, self.count, self._others = views, 1 + views * len(frames), len(poses) - 1
+        self._list_columns(state_names, poses, frames)
 
-    frames: Tensor  # (F, 7), columns of a state: poses of objects
-    seen: Tensor  # (F, P - 1, 7), those of the poses that are seen from each
+    objects: Tensor  # (F, 7), columns of a state: the poses of objects
     hands: Tensor  # (G, 7), columns of an action
     rest: Tensor  # columns of an action that are no pose's
     world: Tensor  # (7,), its pose
+    looked_at: Tensor  # (V F, P - 1 + H, 7), columns of V states side by side: what is seen from each object's frame
+    kept: Tensor  # which of these numbers are features; hands in view 0 stand there twice
+    alike: Tensor  # (D,), the feature of a single view that is the same, but for the view
+    # Of every feature, (D,):
+    seen_from: Tensor  # the frame
+    view: Tensor  # of which state it is
+    owner: Tensor  # the object, HAND or NO_POSE
+    of_pose: Tensor  # whether it is of a pose
 
-    def origins(self, state: Tensor) -> Origins:
-        """The frames (1 + F, B) of the world and of the objects in states (B, S)."""
-        poses = torch.cat([self.world.to(state).expand(1, len(state), 7), state[:, self.frames].transpose(0, 1)])
+    def _list_columns(self, names: list[str], poses: list[list[int]], frames: list[list[int]]) -> None:
+        """What each feature is."""
+        size, still = len(names), [group for group in poses if group not in frames]
+        owners = dict.fromkeys(map(node_of, names), NO_POSE)
+        owners |= {node_of(names[group[0]]): HAND for group in still}
+        owners |= {node_of(names[group[0]]): frame for frame, group in reversed(list(enumerate(frames)))}
+        posed = {column for group in poses for column in group}
+        looked_at, kept, features = [], [], []  # a feature: (alike, seen_from, view, owner, of_pose)
+        for view in range(self.views):
+            for column, name in enumerate(names):
+                features.append((column, 0, view, owners[node_of(name)], column in posed))
+        number = 0
+        for view in range(self.views):
+            for frame, own in enumerate(frames):
+                others = [group for group in poses if group != own]
+                seen = [(group, view) for group in others] + [(group, 0) for group in still]
+                looked_at.append([[column + size * of for column in group] for group, of in seen])
+                for place, (group, of) in enumerate(seen):
+                    owner = frames.index(group) if group in frames else HAND
+                    first = size + 7 * (frame * len(others) + others.index(group))
+                    if view or place < len(others):
+                        kept += range(number, number + 7)
+                        about = (1 + view * len(frames) + frame, of, owner, True)
+                        features += [(first + axis, *about) for axis in range(7)]
+                    number += 7
+        alike, seen_from, of_view, owner, of_pose = zip(*features, strict=True)
+        columns = {"alike": alike, "seen_from": seen_from, "view": of_view, "owner": owner, "kept": kept}
+        for name, value in columns.items():
+            self.register_buffer(name, torch.tensor(value, dtype=torch.long), persistent=False)
+        self.register_buffer("of_pose", torch.tensor(of_pose), persistent=False)
+        shape = (self.views * len(frames), -1, 7)
+        self.register_buffer("looked_at", torch.tensor(looked_at, dtype=torch.long).reshape(shape), persistent=False)
+        self.dim = len(features)
+
+    def origins(self, seen: Tensor) -> Origins:
+        """The frames (1 + V F, B) of the world and of the objects in states and their means (B, V, S)."""
+        poses = seen[:, :, self.objects].permute(1, 2, 0, 3).flatten(0, 1)  # (V F, B, 7)
+        poses = torch.cat([self.world.to(seen).expand(1, len(seen), 7), poses])
         return Origins.at(poses[..., :3], unit(poses[..., 3:]))
 
-    def features(self, state: Tensor, origins: Origins | None = None) -> Tensor:
-        """States (B, S) and beside them (B, D - S) the poses of everything in every object's frame; w >= 0. ``origins`` are those
-        of the states, if they are known."""
-        origins = self.origins(state) if origins is None else origins
-        seen = positive(origins[1:].see(state[:, self.seen].transpose(0, 1)))  # (F, B, P - 1, 7)
-        return torch.cat([state, seen.transpose(0, 1).flatten(1)], dim=-1)
+    def features(self, seen: Tensor, origins: Origins | None = None) -> Tensor:
+        """States and their means (B, V, S), and beside them (B, D - V S) what is seen from every object's frame; w >= 0.
+        ``origins`` are those of ``seen``, if they are known."""
+        origins = self.origins(seen) if origins is None else origins
+        given = seen.flatten(1)
+        return torch.cat([given, self._look(given, origins, self.looked_at)[:, self.kept]], dim=-1)
 
-    def targets(self, action: Tensor, state: Tensor) -> Tensor:
-        """Hands of actions (B, M, A) as seen from the world and from the objects of states (B, S): (1 + F, B, M, G, 7)."""
-        return self.origins(state)[:, :, None].see(action[..., self.hands])
+    def single(self, state: Tensor) -> Tensor:
+        """The features that there are of states (B, S) alone."""
+        poses = self.looked_at[: len(self.objects), : self._others]
+        return torch.cat([state, self._look(state, self.origins(state[:, None]), poses)], dim=-1)
+
+    @staticmethod
+    def _look(given: Tensor, origins: Origins, columns: Tensor) -> Tensor:
+        """Poses in those columns (F, Q, 7) of ``given`` (B, C) as seen from each of the frames but the world's (B, F Q 7)."""
+        poses = positive(origins[1:].see(given[:, columns].transpose(0, 1)))  # (F, B, Q, 7)
+        return poses.transpose(0, 1).flatten(1)
+
+    def targets(self, action: Tensor, seen: Tensor) -> Tensor:
+        """Hands of actions (B, M, A) from every frame of states and their means (B, V, S): (1 + V F, B, M, G, 7)."""
+        return self.origins(seen)[:, :, None].see(action[..., self.hands])
+
+    def moved(self, seen: Tensor) -> Tensor:
+        """Which objects (F,) were carried or pushed just before these states (N, V, S): in the median, they are :data:`MOVED` or
+        more from the longest mean."""
+        places = seen[:, :, self.objects[:, :3]]  # (N, V, F, 3)
+        return (places[:, 0] - places[:, -1]).norm(dim=-1).median(0).values >= MOVED
+
+    def penalties(self, moved: Tensor, still: float, other: float) -> Tensor:
+        """How heavy the penalty of each frame's map is on each feature (1 + V F, D): 1, ``still`` or ``other``.
+
+        1 for the hands as they are now and what has moved, as they are seen from the frame; for the means of the hands too, if
+        something has moved, because they tell how it is held; and for what is no pose, such as an opening or a size, of the
+        hands, of what has moved and of the frame's own object. ``still`` for what stands still, as seen from the frame, and
+        for where the hands are in the world. ``other`` for all else.
+
+        Args:
+            moved: which objects have (F,).
+            still: for what stands still.
+            other: for all else.
+        """
+        frames = torch.arange(self.count, device=moved.device)[:, None]
+        objects, views = (frames - 1) % len(self.objects), (frames - 1).div(len(self.objects), rounding_mode="floor")
+        objects, views = objects.where(frames > 0, NO_POSE - 1), views.clamp_min(0)  # the world's are nobody's
+        hand, thing, now = self.owner == HAND, self.owner >= 0, self.view == 0
+        goes = thing & moved[self.owner.clamp_min(0)]
+        from_here = (self.seen_from == frames) & self.of_pose & (self.view == views)
+        hands_now = (self.seen_from == frames) & self.of_pose & hand & now
+        no_pose = ~self.of_pose & now & (~thing | goes | (self.owner == objects))
+        light = hands_now | no_pose | (from_here & (goes | (hand & moved.any())))
+        middle = (from_here & thing) | ((self.seen_from == 0) & self.of_pose & hand & now)
+        penalty = torch.full(light.shape, other, dtype=torch.float64, device=moved.device)
+        return penalty.masked_fill(middle, still).masked_fill(light, 1.0)
 
 
 class FusedMaps(nn.Module):
@@ -82,20 +181,19 @@ class FusedMaps(nn.Module):
         x = (sum_f P_f)^-1 sum_f P_f (R_f y_f + t_f)        P_f = R_f S_f^-1 R_f^T
 
     and the orientation is the mean of the frames' quaternions, weighted by the inverse of their variances. What is no pose,
-    such as the opening of a hand, has a map of its own.
+    such as the opening of a hand, has a map of its own, with the penalties of the world's.
 
     Args:
-        features: numbers that are seen.
         frames: the frames, and what of an action is a pose.
         starts: frames of a primitive at which plans are made.
         ahead: frames that a plan predicts.
     """
 
-    def __init__(self, features: int, frames: ObjectFrames, starts: int, ahead: int) -> None:
+    def __init__(self, frames: ObjectFrames, starts: int, ahead: int) -> None:
         super().__init__()
-        count, hands, grid = 1 + len(frames.frames), len(frames.hands), (starts, ahead)
-        self.register_buffer("weight", torch.zeros(count, *grid, 7 * hands, features + 1))
-        self.register_buffer("plain", torch.zeros(*grid, len(frames.rest), features + 1))
+        count, hands, grid, numbers = frames.count, len(frames.hands), (starts, ahead), frames.dim + 1
+        self.register_buffer("weight", torch.zeros(count, *grid, 7 * hands, numbers))
+        self.register_buffer("plain", torch.zeros(*grid, len(frames.rest), numbers))
         self.register_buffer("precision", torch.eye(3).expand(count, *grid, hands, 3, 3).clone())
         self.register_buffer("variance", torch.ones(count, *grid, hands))
 
@@ -107,26 +205,29 @@ class FusedMaps(nn.Module):
     @torch.no_grad()
     def fit(
         self,
-        seen: Tensor,
+        features: Tensor,
         start: Tensor,
         frames: ObjectFrames,
-        state: Tensor,
+        seen: Tensor,
         action: Tensor,
         mask: Tensor,
-        ridge: float,
+        ridge: tuple[float, float, float],
         robust: bool,
         noise: Tensor,
     ) -> None:
         """Solve the maps, in float64, see :func:`~lerobot_policy_hdril.dynamics.solve_ridge`.
 
+        Starts that less than half of the executions reach have the maps of the last one before them: there are too few windows
+        to fit so many numbers, and those that last so long are the odd ones.
+
         Args:
-            seen: features (N, D).
+            features: normalised features (N, D).
             start: which of the starts a window has (N,).
             frames: the frames of the states.
-            state: states (N, S) at which windows start.
+            seen: states at which windows start, and their means (N, V, S).
             action: (N, M, A).
-            mask: (N, M), True where there is an action.
-            ridge: weight of the penalty.
+            mask: (N, M), True where there is an action: the first frames of a row, as many as it has.
+            ridge: weight of the penalty; how many times as heavy it is on what stands still, and on what a frame does not see.
             robust: leave out windows that are far off a first fit.
             noise: covariance (D, D) of noise on the features that the maps are to bear; 0 for none. The penalty grows as if every
                 window were seen with such noise, and the covariance of a frame's errors by what the noise adds to them.
@@ -134,51 +235,68 @@ class FusedMaps(nn.Module):
         for buffer, value in ((self.weight, 0.0), (self.plain, 0.0), (self.variance, 1.0)):
             buffer.fill_(value)
         self.precision.copy_(torch.eye(3).expand_as(self.precision))
-        inputs = torch.cat([seen, torch.ones_like(seen[:, :1])], dim=-1).double()
-        poses, rest = frames.targets(action, state).double(), action[..., frames.rest].double()
-        least, noise = ridge_penalty(inputs, ridge), F.pad(noise.double(), (0, 1, 0, 1))
-        for first in start.unique().tolist():
+        if not len(features):
+            return
+        weight, *strict = ridge
+        inputs = torch.cat([features, torch.ones_like(features[:, :1])], dim=-1).double()
+        poses, rest = frames.targets(action, seen).double(), action[..., frames.rest].double()
+        least, noise = ridge_penalty(inputs, weight), F.pad(noise.double(), (0, 1, 0, 1))
+        reached = start.bincount(minlength=self.plain.shape[0])
+        last = int((reached >= SUPPORT * reached[0]).nonzero().max())
+        start = start.clamp_max(last)
+        for first in range(last + 1):
             rows = (start == first) & mask[:, 0]
-            penalty = least + rows.sum() * noise
+            factors = F.pad(frames.penalties(frames.moved(seen[rows]), *strict), (0, 1), value=1.0)  # (1 + V F, D + 1)
             if robust:
-                rows = usual_windows(inputs, action[:, 0].double(), rows, penalty)
-            for step in range(mask.shape[1]):
-                here = rows & mask[:, step]
-                if here.any():
-                    x, y = inputs[here], poses[:, here, step]
-                    self._fit_step(first, step, x, y, rest[here, step], penalty, noise)
+                rows = usual_windows(inputs, action[:, 0].double(), rows, factors[0] * least + rows.sum() * noise)
+            counts, begin = (mask & rows[:, None]).sum(0).tolist(), 0
+            for count, steps in groupby(counts):  # steps that the same rows have are solved together
+                end = begin + len(list(steps))
+                if count:
+                    here = rows & mask[:, begin]
+                    penalty = factors[:, None] * least + count * noise
+                    self._fit_steps(
+                        first, begin, inputs[here], poses[:, here, begin:end], rest[here, begin:end], penalty, noise
+                    )
+                begin = end
+        for buffer, starts in ((self.weight, 1), (self.plain, 0), (self.precision, 1), (self.variance, 1)):
+            by_start = buffer.movedim(starts, 0)
+            by_start[last + 1 :] = by_start[last]
 
-    def _fit_step(
-        self, first: int, step: int, x: Tensor, poses: Tensor, rest: Tensor, penalty: Tensor, noise: Tensor
+    def _fit_steps(
+        self, first: int, begin: int, x: Tensor, poses: Tensor, rest: Tensor, penalty: Tensor, noise: Tensor
     ) -> None:
-        """Poses (1 + F, N, G, 7) and the rest of the actions (N, A - 7 G) from x (N, D + 1)."""
-        outputs = _same_signs(poses).transpose(0, 1).flatten(1)  # (N, (1 + F) G 7)
-        solution, errors = solve_ridge(x, torch.cat([rest, outputs], dim=-1), penalty)
-        count = rest.shape[1]
-        self.plain[first, step] = solution[:count].to(self.plain)
-        self.weight[:, first, step] = solution[count:].unflatten(0, (len(poses), -1)).to(self.weight)
-        far = errors[:, count:].unflatten(1, (len(poses), -1, 7))  # (N, 1 + F, G, 7)
-        second = torch.einsum("nfgi,nfgj->fgij", far, far) / len(far)
-        weight = solution[count:].unflatten(0, (len(poses), -1, 7))
-        second += torch.einsum("fgid,de,fgje->fgij", weight, noise, weight)
+        """Of the start ``first``, the steps from ``begin`` on: poses (1 + V F, N, m, G, 7) and the rest of the actions
+        (N, m, A - 7 G) from x (N, D + 1), with a penalty for each frame (1 + V F, D + 1, D + 1)."""
+        poses = _same_signs(poses)
+        count, rows, steps, hands = poses.shape[:4]
+        outputs = torch.cat([poses.flatten(3), rest.expand(count, *rest.shape)], dim=-1)  # (1 + V F, N, m, A)
+        solution, errors = solve_ridge(x, outputs.flatten(2), penalty)
+        solution, errors = solution.unflatten(1, (steps, -1)), errors.unflatten(2, (steps, -1))
+        here = slice(begin, begin + steps)
+        self.plain[first, here] = solution[0, :, 7 * hands :].to(self.plain)
+        weight = solution[:, :, : 7 * hands]  # (1 + V F, m, G 7, D + 1)
+        self.weight[:, first, here] = weight.to(self.weight)
+        far = errors[..., : 7 * hands].unflatten(-1, (hands, 7))  # (1 + V F, N, m, G, 7)
+        second = torch.einsum("fnmgi,fnmgj->fmgij", far, far) / rows
+        weight = weight.unflatten(2, (hands, 7))
+        second += torch.einsum("fmgid,fmgjd->fmgij", weight @ noise, weight)
         position, turn = second[..., :3, :3], second[..., 3:, 3:].diagonal(dim1=-2, dim2=-1).sum(-1)
-        self.precision[:, first, step] = torch.linalg.inv(position + _FLOOR * torch.eye(3).to(second)).to(
-            self.precision
-        )
-        self.variance[:, first, step] = (turn + _FLOOR).to(self.variance)
+        precision = torch.linalg.inv(position + _FLOOR * torch.eye(3).to(second))
+        self.precision[:, first, here] = precision.to(self.precision)
+        self.variance[:, first, here] = (turn + _FLOOR).to(self.variance)
 
-    def forward(self, seen: Tensor, start: Tensor, frames: ObjectFrames, origins: Origins) -> Tensor:
-        """Features (B, D) at starts (B,) of plans, and the frames' origins there (1 + F, B), to actions (B, M, A) in the
+    def forward(self, features: Tensor, start: Tensor, frames: ObjectFrames, origins: Origins) -> Tensor:
+        """Features (B, D) at starts (B,) of plans, and the frames' origins there (1 + V F, B), to actions (B, M, A) in the
         world."""
-        inputs = F.pad(seen, (0, 1), value=1.0)[:, None, None]
-        told = (self.weight.index_select(1, start) * inputs).sum(-1).unflatten(-1, (-1, 7))  # (1 + F, B, M, G, 7)
+        inputs = F.pad(features, (0, 1), value=1.0)[:, None, None]
+        told = (self.weight.index_select(1, start) * inputs).sum(-1).unflatten(-1, (-1, 7))  # (1 + V F, B, M, G, 7)
         poses = origins[:, :, None].place(told)
         means, axes = poses[..., :3], origins.rotation[:, :, None, None]
-        precision = axes @ self.precision.index_select(1, start) @ axes.mT
-        # Of the differences from the world's mean, which are small: precisions may differ by five orders of magnitude, and mixed
-        # precision may round them.
-        far = (precision @ (means - means[:1])[..., None]).sum(0)
-        position = means[0] + torch.linalg.solve(precision.sum(0), far)[..., 0]
+        precision = product(product(axes, self.precision.index_select(1, start)), axes.mT)
+        # Of the differences from the world's mean, which are small: precisions may differ by five orders of magnitude.
+        far = apply(precision, means - means[:1]).sum(0)
+        position = means[0] + torch.linalg.solve(precision.sum(0), far[..., None])[..., 0]
         rotations = unit(poses[..., 3:])
         quaternion = (_towards(rotations, rotations[:1]) / self.variance.index_select(1, start)[..., None]).sum(0)
         rest = (self.plain.index_select(0, start) * inputs).sum(-1)
@@ -189,8 +307,8 @@ class FusedMaps(nn.Module):
 
 
 def _same_signs(poses: Tensor) -> Tensor:
-    """Poses (F, N, G, 7) whose quaternions have the sign that is nearer to those of the other windows."""
-    quaternion = _towards(poses[..., 3:], poses[:, :1, :, 3:])  # so that they have a mean
+    """Poses (F, N, ..., 7) whose quaternions have the sign that is nearer to those of the other windows."""
+    quaternion = _towards(poses[..., 3:], poses[:, :1, ..., 3:])  # so that they have a mean
     return torch.cat([poses[..., :3], _towards(quaternion, quaternion.mean(1, keepdim=True))], dim=-1)
 
 

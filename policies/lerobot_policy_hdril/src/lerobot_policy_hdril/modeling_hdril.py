@@ -140,10 +140,10 @@ class HDRILPolicy(PreTrainedPolicy):
             self.hand_noise = HandNoise(config.state_names, config.action_names, config.hand_noise)
         self.frames = self.fused = None
         if fused:
-            frames = self.frames = ObjectFrames(names, config.environment_names, config.action_names)
-            seen = frames.dim * (1 + len(config.filters))
+            views = 1 + len(config.filters)
+            frames = self.frames = ObjectFrames(names, config.environment_names, config.action_names, views)
             starts = -(-self.capacity // self.ahead)
-            self.fused = nn.ModuleList(FusedMaps(seen, frames, starts, self.ahead) for _ in config.primitives)
+            self.fused = nn.ModuleList(FusedMaps(frames, starts, self.ahead) for _ in config.primitives)
             self.register_buffer("feature_mean", torch.zeros(frames.dim))
             self.register_buffer("feature_std", torch.ones(frames.dim))
         for key, size in (("state", state_dim), ("output", action_dim + state_dim)):
@@ -332,13 +332,10 @@ class HDRILPolicy(PreTrainedPolicy):
         return self.dynamics_input(seen).flatten(1)
 
     def features(self, seen: Tensor) -> tuple[Tensor, Origins]:
-        """What the fused maps see of states and of the means of the last ones (B, 1 + W, S); and the origins (1 + F, B) of
-        their frames in the states."""
+        """What the fused maps see of states and of the means of the last ones (B, 1 + W, S); and the origins of their frames."""
         assert self.frames is not None
-        given = seen.transpose(0, 1).flatten(0, 1)
-        origins = self.frames.origins(given)
-        features = (self.frames.features(given, origins) - self.feature_mean) / self.feature_std
-        return torch.cat(features.split(len(seen)), dim=-1), origins[:, : len(seen)]
+        origins = self.frames.origins(seen)
+        return (self.frames.features(seen, origins) - self.feature_mean) / self.feature_std, origins
 
     def _fused(self, seen: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
         """Normalised outputs (B, M, A + S) of the fused maps; 0 for the states, which they do not predict."""
@@ -366,7 +363,8 @@ class HDRILPolicy(PreTrainedPolicy):
 
     def _network(self, seen: Tensor, primitive: Tensor, elapsed: Tensor) -> tuple[Tensor, Tensor]:
         state, samples = seen[:, 0], self.config.samples
-        normalised, linear = self.dynamics_input(state), self.linear_input(seen)
+        normalised = self.dynamics_input(state)
+        linear = self.linear_input(seen) if self.fused is None else normalised  # which nothing reads then
         steps = self.steps(elapsed)
         if not self.config.per_primitive:
             context = F.one_hot(primitive, len(self.config.primitives)).to(state.dtype)

@@ -56,7 +56,7 @@ def _presets() -> dict[str, dict[str, Any]]:
         "filter_frames": 8,
         "long_filter_frames": 24,
         "robust": True,
-        "hand_noise": 0.002,
+        "hand_noise": 0.005,
         "replan_every": 2,
     }
     every["linear_reactive"] = every["hdril_reactive"] | {"decoder": "linear"}
