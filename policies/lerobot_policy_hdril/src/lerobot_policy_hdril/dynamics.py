@@ -24,8 +24,8 @@ def ridge_penalty(inputs: Tensor, ridge: float) -> Tensor:
 
 
 def solve_ridge(x: Tensor, y: Tensor, penalty: Tensor) -> tuple[Tensor, Tensor]:
-    """The maps (..., W, D) of inputs x (N, D) to outputs y (..., N, W), with penalties (..., D, D), and their leave-one-out errors
-    (..., N, W).
+    """The maps (..., W, D) of inputs x (N, D) to outputs y (..., N, W), with penalties (..., D, D), and their leave-one-out
+    errors (..., N, W).
 
     The error of a row, had the map been solved without it, is its residual over 1 - h, with h = x (X^T X + P)^-1 x^T.
     """
