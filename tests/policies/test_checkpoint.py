@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import asdict, fields
 from importlib import import_module
@@ -11,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from draccus.utils import ParsingError
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import make_policy
 from lerobot_policy_hdril import HDRILConfig, HDRILPolicy, fitting
@@ -205,41 +207,34 @@ def test_weights_that_are_missing_unknown_or_of_another_shape(damaged: Path) -> 
         load(damaged)
 
 
-@pytest.mark.parametrize(
-    ("preset", "later"),
-    [
-        (
-            "hdril",
-            [
-                "termination",
-                "filter_frames",
-                "long_filter_frames",
-                "robust",
-                "hand_noise",
-                "coordinates",
-                "replan_every",
-            ],
-        ),
-        ("hdril_reactive", ["long_filter_frames"]),
-        ("hdril_reactive", ["hand_noise", "long_filter_frames"]),
-    ],
-)
-def test_older_checkpoint_acts_as_it_did_whatever_the_defaults_are_now(
-    preset: str, later: list[str], metadata, tmp_path: Path
-) -> None:
-    """Its config lacks the options that came later."""
-    plain = {"hand_noise": 0.0} if "hand_noise" in later else {}
-    saved = build(metadata, preset=preset, hidden_dim=32, long_filter_frames=1, **plain).eval()
-    saved.save_pretrained(tmp_path)
-    values = json.loads((tmp_path / "config.json").read_text())
-    for name in later:
+def without(folder: Path, names: list[str]) -> None:
+    """Take options out of a checkpoint's config, as if they had come later."""
+    values = json.loads((folder / "config.json").read_text())
+    for name in names:
         del values[name]
-    (tmp_path / "config.json").write_text(json.dumps(values))
+    (folder / "config.json").write_text(json.dumps(values))
+
+
+def test_older_checkpoint_acts_as_it_did_whatever_the_defaults_are_now(metadata, tmp_path: Path) -> None:
+    """Its config lacks the options that came later."""
+    saved = build(metadata, preset="hdril", hidden_dim=32).eval()
+    saved.save_pretrained(tmp_path)
+    later = ["termination", "filter_frames", "long_filter_frames", "robust", "hand_noise", "coordinates", "replan_every"]
+    without(tmp_path, [*later, "ridge_still", "ridge_other"])
     older = load(tmp_path)
     assert asdict(older.config) == asdict(HDRILConfig(**asdict(saved.config) | {"pretrained_path": None}))
     first = observation(metadata, [0])
     saved.reset()
     assert torch.equal(older.select_action(first), saved.select_action(first))
+
+
+def test_older_checkpoint_whose_maps_see_something_else_is_refused(metadata, tmp_path: Path) -> None:
+    build(metadata, preset="hdril_reactive", hidden_dim=32).save_pretrained(tmp_path)
+    without(tmp_path, ["ridge_still", "ridge_other"])
+    with pytest.raises((ValueError, ParsingError)) as raised:
+        load(tmp_path)
+    told = str(raised.value.__cause__ or raised.value)  # draccus wraps what a config says of itself
+    assert re.match(r"the checkpoint has policy\.coordinates=fused of a version .*: train it anew, or ", told), told
 
 
 def test_fused_predictions_that_are_damaged_on_purpose_change_in_one_primitive(

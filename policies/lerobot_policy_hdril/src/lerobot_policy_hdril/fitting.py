@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 NOISY_COPIES = 4
 """Disturbed copies of each window that tell how much noise of the hands moves what the fused maps see."""
-GROWTH = 10
+GROWTH = 4
 """Fit anew when one new episode has come for every so many of the last fit, ..."""
 QUIET = 10
 """... or when so many batches in a row brought none. To fit all episodes anew after each straggler would cost more than
