@@ -219,7 +219,15 @@ def test_older_checkpoint_acts_as_it_did_whatever_the_defaults_are_now(metadata,
     """Its config lacks the options that came later."""
     saved = build(metadata, preset="hdril", hidden_dim=32).eval()
     saved.save_pretrained(tmp_path)
-    later = ["termination", "filter_frames", "long_filter_frames", "robust", "hand_noise", "coordinates", "replan_every"]
+    later = [
+        "termination",
+        "filter_frames",
+        "long_filter_frames",
+        "robust",
+        "hand_noise",
+        "coordinates",
+        "replan_every",
+    ]
     without(tmp_path, [*later, "ridge_still", "ridge_other"])
     older = load(tmp_path)
     assert asdict(older.config) == asdict(HDRILConfig(**asdict(saved.config) | {"pretrained_path": None}))
