@@ -186,7 +186,7 @@ def test_fit_follows_when_a_quarter_more_are_new_or_no_more_come() -> None:
     learned.mark_fitted()
     assert not learned.join(torch.tensor([0]))
     assert not learned.fit_is_due()
-    assert learned.records()[0].fitted == 56
+    assert learned.records()[0].fitted == 64
 
 
 def test_the_last_episode_of_all_is_fitted_too() -> None:
