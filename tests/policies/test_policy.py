@@ -140,7 +140,7 @@ def test_plan_undoes_what_the_target_did(coordinates: str, metadata, monkeypatch
 
 @pytest.mark.parametrize(
     ("preset", "every"),
-    [("hdril", 4), ("hdril_paper", 4), ("res_multi_relational", 4), ("hdril_reactive", 4), ("hdril_reactive", 1)],
+    [("hdril", 4), ("hdril_paper", 4), ("res_multi_relational", 4), ("network_reactive", 4), ("network_reactive", 1)],
 )
 def test_stacked_models_are_the_separate_ones(preset: str, every: int, metadata) -> None:
     """Same predictions with several primitives in the batch, same loss gradients, at the start and within primitives."""
@@ -280,7 +280,7 @@ def test_one_primitive_and_one_episode_and_a_batch_of_one(copy: Path) -> None:
 
 @pytest.mark.parametrize(
     ("linear", "whole"),
-    [("linear", {}), ("linear_every_frame", {"replan_every": 1}), ("linear_reactive", {"preset": "hdril_reactive"})],
+    [("linear", {}), ("linear_every_frame", {"replan_every": 1}), ("hdril_reactive", {"preset": "network_reactive"})],
 )
 def test_linear_maps_alone_predict_what_the_whole_does_before_its_network_learns(linear: str, whole, metadata) -> None:
     alone, whole = build(metadata, preset=linear).eval(), build(metadata, **{"preset": "hdril"} | whole).eval()
@@ -299,7 +299,10 @@ def test_linear_maps_alone_predict_what_the_whole_does_before_its_network_learns
 )
 def test_linear_maps_alone_refuse_what_would_act_on_nothing(given) -> None:
     with pytest.raises(ValueError, match=r"policy\.decoder=(linear needs|gru; got linear)"):
-        HDRILConfig(device="cpu", push_to_hub=False, decoder="linear", **given)
+        HDRILConfig(device="cpu", push_to_hub=False, coordinates="absolute", decoder="linear", **given)
+
+
+OURS = ("hdril", "linear", "network")
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -308,9 +311,9 @@ def test_preset_is_what_its_name_says(preset: str) -> None:
     for name, value in PRESETS[preset].items():
         assert getattr(config, name) == value
     assert (config.coordinates == "relational") == preset.endswith("_relational")
-    assert config.per_primitive == ("multi" in preset or preset.startswith(("hdril", "linear")))
-    assert config.skip == (preset.startswith(("res", "hdril", "linear")))
-    assert (config.decoder == "linear") == preset.startswith("linear")
+    assert config.per_primitive == ("multi" in preset or preset.startswith(OURS))
+    assert config.skip == (preset.startswith(("res", *OURS)))
+    assert (config.decoder == "linear") == (preset.startswith("linear") or preset == "hdril_reactive")
     assert (config.interaction == "none") == preset.startswith(("gru_gru", "res_", "res_multi")) or preset == "res"
     assert (config.termination == "learned") == (config.coordinates == "fused") == preset.endswith("_reactive")
 

@@ -142,7 +142,7 @@ def test_the_filters_of_the_demonstrations_are_those_of_the_policy(
             torch.testing.assert_close(data.seen[FRAMES + last, 1 + t], mean)
 
 
-@pytest.mark.parametrize("values", [{}, {"coordinates": "relational"}, {"preset": "hdril_reactive"}])
+@pytest.mark.parametrize("values", [{}, {"coordinates": "relational"}, {"preset": "network_reactive"}])
 def test_the_maps_see_the_state_first_and_then_each_mean(values: dict[str, Any], metadata) -> None:
     """Checkpoints hold maps for this order. The network and the frames of what is planned go by the state alone."""
     policy = build(metadata, **values, filter_frames=4, long_filter_frames=9, hidden_dim=32).eval()
@@ -626,7 +626,7 @@ def test_noise_disturbs_training_alone(metadata) -> None:
     "values", [{"per_primitive": False}, {"latent": "variational", "samples": 2}, {"interaction": "scalar"}]
 )
 def test_the_defaults_with_another_value_learn_and_act(values: dict[str, Any], metadata, tmp_path: Path) -> None:
-    policy = build(metadata, **PRESETS["hdril_reactive"] | values)
+    policy = build(metadata, **PRESETS["network_reactive"] | values)
     policy.train().forward({"index": BATCH})[0].backward()
     policy.eval().save_pretrained(tmp_path)
     loaded = HDRILPolicy.from_pretrained(tmp_path)

@@ -85,8 +85,9 @@ class HDRILConfig(SingleFrameConfig):
     per_primitive: bool = True
     """One dynamics model per primitive (the paper's Multi), or one for all that is told the primitive. Fused linear maps are one
     for each in any case."""
-    decoder: Decoder = "gru"
-    """``ode``: the paper's other decoder. ``linear``: no network, the linear maps predict alone; a baseline for the others."""
+    decoder: Decoder = "linear"
+    """``linear``: no network, the linear maps predict alone. ``gru``: a network learns what they leave, or all; the default where
+    coordinates are not fused. ``ode``: the paper's other decoder."""
     coordinates: Coordinates = "fused"
     """Of the dynamics. ``relational``: hands and predictions in the frame of the first object, as it stands when a plan is
     made. ``fused``: the linear maps predict the next actions in the world's and every object's frame, and the predictions
@@ -185,6 +186,8 @@ class HDRILConfig(SingleFrameConfig):
             self._apply_preset()
         if self.coordinates != "fused" and "hand_noise" not in self._given:
             self.hand_noise = 0.0
+        if self.coordinates != "fused" and "decoder" not in self._given and not self.preset:
+            self.decoder = "gru"
         if not self.state_skip:
             for name in _FILTERS:
                 if name not in self._given:
@@ -210,13 +213,14 @@ class HDRILConfig(SingleFrameConfig):
             raise ValueError("policy.kl_weight and policy.samples are for policy.latent=variational")
         if self.experts == "stacked" and self.decoder != "gru":
             raise ValueError(f"policy.experts=stacked works with policy.decoder=gru; got {self.decoder}")
+        if self.coordinates == "fused":
+            self._check_fused()
         if self.decoder == "linear" and not (self.state_skip and self.per_primitive and self.latent == "deterministic"):
             raise ValueError(
                 "policy.decoder=linear needs policy.state_skip=true, policy.per_primitive=true and "
-                f"policy.latent=deterministic; got {self.state_skip}, {self.per_primitive} and {self.latent}"
+                f"policy.latent=deterministic; got {self.state_skip}, {self.per_primitive} and {self.latent}; "
+                "give policy.decoder=gru for a network"
             )
-        if self.coordinates == "fused":
-            self._check_fused()
         for name in _FILTERS:
             if getattr(self, name) > 1 and not self.state_skip:
                 raise ValueError(

@@ -26,12 +26,11 @@ class Attention:
     planner: Tensor  # (B, N, N)
     dynamics: Tensor  # (B, N, N), of the model of the primitive that plays
 
-    def received(self) -> dict[str, Tensor]:
-        """For every hand and object, the share (B,) of the dynamics model's attention that goes to it, mean over all
-        nodes; the shares sum to 1."""
-        return {
-            name: self.dynamics[:, :, columns].sum(-1).mean(-1) for name, columns in group_nodes(self.nodes).items()
-        }
+    def received(self, planner: bool = False) -> dict[str, Tensor]:
+        """For every hand and object, the share (B,) of the dynamics model's attention that goes to it, or of the planner's, mean
+        over all nodes; the shares sum to 1."""
+        weights = self.planner if planner else self.dynamics
+        return {name: weights[:, :, columns].sum(-1).mean(-1) for name, columns in group_nodes(self.nodes).items()}
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,8 @@ class Explanation:
     """Actions (M, A) from this frame to the end of the plan, if it was made at this frame; None otherwise. It ends with
     the longest recorded form of the primitive."""
     attention: dict[str, float]
-    """Share of the dynamics model's attention that each hand and object receives; the shares sum to 1."""
+    """Share of the dynamics model's attention that each hand and object receives, or of the planner's where the dynamics are
+    linear maps, which attend to nobody; the shares sum to 1."""
     events: tuple[str, ...] = ()
     """What happened at this frame, in words."""
 
@@ -68,6 +68,7 @@ def attend(policy: HDRILPolicy, playback: PlaybackState) -> Attention:
 def explain(policy: HDRILPolicy, playback: PlaybackState, row: int) -> Explanation:
     """Plain values of one row of the batch."""
     names, attention = policy.config.primitives, attend(policy, playback.select(row))
+    received = attention.received(planner=policy.config.decoder == "linear")
     plan = None
     if playback.replanned[row]:
         rest = playback.select(row).rest(policy.longest_length)
@@ -76,7 +77,7 @@ def explain(policy: HDRILPolicy, playback: PlaybackState, row: int) -> Explanati
         primitive=names[int(playback.primitive[row])],
         probabilities=dict(zip(names, playback.probabilities[row].tolist(), strict=True)),
         plan=plan,
-        attention={name: float(share[0]) for name, share in attention.received().items()},
+        attention={name: float(share[0]) for name, share in received.items()},
         events=_events(names, playback, row),
     )
 

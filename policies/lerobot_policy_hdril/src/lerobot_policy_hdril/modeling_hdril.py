@@ -356,10 +356,13 @@ class HDRILPolicy(PreTrainedPolicy):
     def predict(self, seen: Tensor, primitive: Tensor, elapsed: Tensor) -> tuple[Tensor, Tensor]:
         """Normalised actions and states (B, M, A + S), and divergence of the latent (B,), nats, from raw states and the means of
         the last ones (B, 1 + W, S), ``elapsed`` (B,) frames into primitives (B,)."""
-        output, divergence = self._network(seen, primitive, elapsed)
-        if self.fused is not None:
-            output = output + self._fused(seen, primitive, elapsed)
-        return output, divergence
+        if self.fused is None:
+            return self._network(seen, primitive, elapsed)
+        output = self._fused(seen, primitive, elapsed)
+        if self.config.decoder == "linear":
+            return output, output.new_zeros(len(output))
+        rest, divergence = self._network(seen, primitive, elapsed)
+        return output + rest, divergence
 
     def _network(self, seen: Tensor, primitive: Tensor, elapsed: Tensor) -> tuple[Tensor, Tensor]:
         state, samples = seen[:, 0], self.config.samples

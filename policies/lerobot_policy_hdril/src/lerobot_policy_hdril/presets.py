@@ -58,8 +58,9 @@ def _presets() -> dict[str, dict[str, Any]]:
         "robust": True,
         "hand_noise": 0.005,
         "replan_every": 2,
+        "decoder": "linear",
     }
-    every["linear_reactive"] = every["hdril_reactive"] | {"decoder": "linear"}
+    every["network_reactive"] = every["hdril_reactive"] | {"decoder": "gru"}
     return every
 
 
