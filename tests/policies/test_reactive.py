@@ -32,7 +32,7 @@ POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 HAND, CUP, SHELF = ([f"{name}.{axis}" for axis in POSE] for name in ("left_ee", "cup", "shelf"))
 STATE = [*HAND, *CUP, *SHELF, "cup.size"]
 ACTION = [*HAND, "left_gripper.pos"]
-LEAST = (1e-6, 1.0, 1.0)  # a penalty that hardly matters, on all alike
+LEAST = (1e-6, 1e-6, 1e-6)  # a penalty that hardly matters, on all alike
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -358,7 +358,7 @@ def test_a_map_sees_most_freely_what_its_frame_shows(moved: tuple[str, ...]) -> 
     """Feature by feature, what the docstring says."""
     names, things = [*STATE, "left_gripper.pos", "goal.x"], ["cup", "shelf"]
     frames = ObjectFrames(names, [*CUP, *SHELF, "cup.size", "goal.x"], ACTION, 2).double()
-    penalties = frames.penalties(torch.tensor([name in moved for name in things]), 30.0, 300.0)
+    penalties = frames.penalties(torch.tensor([name in moved for name in things]), 1.0, 30.0, 300.0)
     owners = {HAND_OWNER: "left", 0: "cup", 1: "shelf", NO_POSE: "goal"}
     for number, row in enumerate(penalties.tolist()):
         view, own = (0, "") if not number else divmod(number - 1, 2)
@@ -427,7 +427,7 @@ def test_from_few_demonstrations_it_helps_to_know_what_a_frame_sees() -> None:
         given = maps(inputs[1], torch.zeros(200, dtype=torch.long), frames, frames.origins(test))
         return (given[:, 0, :3] - told(test)[:, :3]).norm(dim=-1).mean()
 
-    assert errors((0.1, 30.0, 300.0)) < 0.5 * errors((0.1, 1.0, 1.0))
+    assert errors((0.1, 3.0, 30.0)) < 0.5 * errors((0.1, 0.1, 0.1))
 
 
 def fitted(target: Any, count: int = 300) -> tuple[FusedMaps, ObjectFrames]:

@@ -30,7 +30,7 @@ _FREE = ("hidden_dim", "termination", "filter_frames", "long_filter_frames", "ro
 """Options that may differ from the preset's value."""
 _FILTERS = ("filter_frames", "long_filter_frames")
 """Options that give the lengths of the means, frames."""
-_RIDGES = ("ridge", "ridge_still", "ridge_other")
+_RIDGES = ("ridge", "ridge_seen", "ridge_still", "ridge_other")
 _BEFORE = PLAIN | {"coordinates": "absolute"}
 """Values of options whose default was another one, or which were not there, when a checkpoint without them was saved."""
 
@@ -121,13 +121,14 @@ class HDRILConfig(SingleFrameConfig):
     state_loss_weight: float = 0.5
     """Weight of the predicted states beside that of the actions."""
     ridge: float = 1.0
-    """Penalty on the squared weights of the linear maps (``state_skip``), which are solved, not trained."""
-    ridge_still: float = 30.0
-    """For ``coordinates=fused``: how many times as heavy the penalty is on what stands still, as it is seen from a frame, and on
-    where the hands are in the world. The hands and what is carried have the penalty ``ridge``."""
+    """Penalty on the squared weights of linear maps that are not fused (``state_skip``); they are solved, not trained."""
+    ridge_seen: float = 0.01
+    """Penalty on the weights of a fused map for what its frame sees: the hands, and what is carried. Light, because a few
+    demonstrations at the end of a movement differ by centimetres: a heavy one would draw a hand off the place that it goes to."""
+    ridge_still: float = 3.0
+    """The same for what stands still, as it is seen from the frame, and for where the hands are in the world."""
     ridge_other: float = 300.0
-    """For ``coordinates=fused``: the same for all that is not seen from the frame. A few demonstrations cannot tell which of some
-    hundred numbers matter."""
+    """The same for all that is not seen from the frame. A few demonstrations cannot tell which of some hundred numbers matter."""
     min_std: float = 0.01
     """Floor of the deviations that normalise the data, m or dimensionless: numbers that hardly vary must not dominate."""
 

@@ -16,10 +16,14 @@ FAR = 5.0
 """Medians of the distance from a robust fit, beyond which a demonstration is left out of it."""
 
 
+FREE = 1e-6
+"""Penalty on the constant of a map, which is as good as none."""
+
+
 def ridge_penalty(inputs: Tensor, ridge: float) -> Tensor:
     """The penalty (D, D) on maps of inputs (N, D), the last of which is 1: that weight is free."""
     penalty = ridge * torch.eye(inputs.shape[1], dtype=inputs.dtype, device=inputs.device)
-    penalty[-1, -1] = 1e-6
+    penalty[-1, -1] = FREE
     return penalty
 
 

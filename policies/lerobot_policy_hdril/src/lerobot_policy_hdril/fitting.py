@@ -126,7 +126,7 @@ def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Te
             window.seen,
             window.target[..., : len(config.action_names)],
             window.mask,
-            (config.ridge, config.ridge_still, config.ridge_other),
+            (config.ridge_seen, config.ridge_still, config.ridge_other),
             config.robust,
             noise_covariance(policy, window, features),
         )

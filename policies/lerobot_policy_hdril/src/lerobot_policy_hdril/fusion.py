@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lerobot_policy_hdril.coordinates import Origins, apply, positive, product, unit
-from lerobot_policy_hdril.dynamics import ridge_penalty, solve_ridge, usual_windows
+from lerobot_policy_hdril.dynamics import FREE, solve_ridge, usual_windows
 from lerobot_policy_hdril.graph import node_of, pose_groups
 
 _FLOOR = 1e-7
@@ -145,18 +145,17 @@ class ObjectFrames(nn.Module):
         places = seen[:, :, self.objects[:, :3]]  # (N, V, F, 3)
         return (places[:, 0] - places[:, -1]).norm(dim=-1).median(0).values >= MOVED
 
-    def penalties(self, moved: Tensor, still: float, other: float) -> Tensor:
-        """How heavy the penalty of each frame's map is on each feature (1 + V F, D): 1, ``still`` or ``other``.
+    def penalties(self, moved: Tensor, seen: float, still: float, other: float) -> Tensor:
+        """The penalty of each frame's map on each feature (1 + V F, D): one of the three.
 
-        1 for the hands as they are now and what has moved, as they are seen from the frame; for the means of the hands too, if
-        something has moved, because they tell how it is held; and for what is no pose, such as an opening or a size, of the
-        hands, of what has moved and of the frame's own object. ``still`` for what stands still, as seen from the frame, and
+        ``seen`` for the hands as they are now and what has moved, as they are seen from the frame; for the means of the hands
+        too, if something has moved, because they tell how it is held; and for what is no pose, such as an opening or a size, of
+        the hands, of what has moved and of the frame's own object. ``still`` for what stands still, as seen from the frame, and
         for where the hands are in the world. ``other`` for all else.
 
         Args:
             moved: which objects have (F,).
-            still: for what stands still.
-            other: for all else.
+            seen, still, other: the penalties.
         """
         frames = torch.arange(self.count, device=moved.device)[:, None]
         objects, views = (frames - 1) % len(self.objects), (frames - 1).div(len(self.objects), rounding_mode="floor")
@@ -169,7 +168,7 @@ class ObjectFrames(nn.Module):
         light = hands_now | no_pose | (from_here & (goes | (hand & moved.any())))
         middle = (from_here & thing) | ((self.seen_from == 0) & self.of_pose & hand & now)
         penalty = torch.full(light.shape, other, dtype=torch.float64, device=moved.device)
-        return penalty.masked_fill(middle, still).masked_fill(light, 1.0)
+        return penalty.masked_fill(middle, still).masked_fill(light, seen)
 
 
 class FusedMaps(nn.Module):
@@ -227,7 +226,7 @@ class FusedMaps(nn.Module):
             seen: states at which windows start, and their means (N, V, S).
             action: (N, M, A).
             mask: (N, M), True where there is an action: the first frames of a row, as many as it has.
-            ridge: weight of the penalty; how many times as heavy it is on what stands still, and on what a frame does not see.
+            ridge: the penalties on what a frame sees, on what stands still there, and on all else.
             robust: leave out windows that are far off a first fit.
             noise: covariance (D, D) of noise on the features that the maps are to bear; 0 for none. The penalty grows as if every
                 window were seen with such noise, and the covariance of a frame's errors by what the noise adds to them.
@@ -237,27 +236,24 @@ class FusedMaps(nn.Module):
         self.precision.copy_(torch.eye(3).expand_as(self.precision))
         if not len(features):
             return
-        weight, *strict = ridge
         inputs = torch.cat([features, torch.ones_like(features[:, :1])], dim=-1).double()
         poses, rest = frames.targets(action, seen).double(), action[..., frames.rest].double()
-        least, noise = ridge_penalty(inputs, weight), F.pad(noise.double(), (0, 1, 0, 1))
+        noise = F.pad(noise.double(), (0, 1, 0, 1))
         reached = start.bincount(minlength=self.plain.shape[0])
         last = int((reached >= SUPPORT * reached[0]).nonzero().max())
         start = start.clamp_max(last)
         for first in range(last + 1):
             rows = (start == first) & mask[:, 0]
-            factors = F.pad(frames.penalties(frames.moved(seen[rows]), *strict), (0, 1), value=1.0)  # (1 + V F, D + 1)
+            least = F.pad(frames.penalties(frames.moved(seen[rows]), *ridge), (0, 1), value=FREE).diag_embed()
             if robust:
-                rows = usual_windows(inputs, action[:, 0].double(), rows, factors[0] * least + rows.sum() * noise)
+                rows = usual_windows(inputs, action[:, 0].double(), rows, least[0] + rows.sum() * noise)
             counts, begin = (mask & rows[:, None]).sum(0).tolist(), 0
             for count, steps in groupby(counts):  # steps that the same rows have are solved together
                 end = begin + len(list(steps))
                 if count:
                     here = rows & mask[:, begin]
-                    penalty = factors[:, None] * least + count * noise
-                    self._fit_steps(
-                        first, begin, inputs[here], poses[:, here, begin:end], rest[here, begin:end], penalty, noise
-                    )
+                    targets = poses[:, here, begin:end], rest[here, begin:end]
+                    self._fit_steps(first, begin, inputs[here], *targets, least + count * noise, noise)
                 begin = end
         for buffer, starts in ((self.weight, 1), (self.plain, 0), (self.precision, 1), (self.variance, 1)):
             by_start = buffer.movedim(starts, 0)
