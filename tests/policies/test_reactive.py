@@ -32,7 +32,7 @@ POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 HAND, CUP, SHELF = ([f"{name}.{axis}" for axis in POSE] for name in ("left_ee", "cup", "shelf"))
 STATE = [*HAND, *CUP, *SHELF, "cup.size"]
 ACTION = [*HAND, "left_gripper.pos"]
-LEAST = (1e-6, 1e-6, 1e-6)  # a penalty that hardly matters, on all alike
+LEAST = [(1e-6, 1e-6, 1e-6)]  # a penalty that hardly matters, on all alike
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -408,7 +408,7 @@ def test_from_few_demonstrations_it_helps_to_know_what_a_frame_sees() -> None:
     """The hand is to go half of the way to the cup's side; what is seen from elsewhere says nothing."""
     frames, noise = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION, 3).double(), 2e-3
 
-    def errors(ridge: tuple[float, float, float]) -> Tensor:
+    def errors(*ridges: tuple[float, float, float]) -> float:
         maps, train, test = FusedMaps(frames, 1, 1).double(), views(20, 40), views(200, 60)
 
         def told(seen: Tensor) -> Tensor:
@@ -422,12 +422,15 @@ def test_from_few_demonstrations_it_helps_to_know_what_a_frame_sees() -> None:
         mean, std = features[0].mean(0), features[0].std(0)
         inputs = [(part - mean) / std for part in features]
         start, mask = torch.zeros(20, dtype=torch.long), torch.ones(20, 1, dtype=torch.bool)
-        nothing = torch.zeros(frames.dim, frames.dim)
-        maps.fit(inputs[0], start, frames, train, action, mask, ridge, False, nothing)
+        quiet = torch.zeros(frames.dim, frames.dim)
+        maps.fit(inputs[0], start, frames, train, action, mask, ridges, False, quiet)
         given = maps(inputs[1], torch.zeros(200, dtype=torch.long), frames, frames.origins(test))
-        return (given[:, 0, :3] - told(test)[:, :3]).norm(dim=-1).mean()
+        return (given[:, 0, :3] - told(test)[:, :3]).norm(dim=-1).mean().item()
 
-    assert errors((0.1, 3.0, 30.0)) < 0.5 * errors((0.1, 0.1, 0.1))
+    freely, alike, nothing = (0.1, 3.0, 30.0), (0.1, 0.1, 0.1), (1e4, 1e4, 1e4)
+    assert errors(freely) < 0.5 * errors(alike)
+    assert errors(nothing) > 2.0 * errors(freely)
+    assert errors(nothing, freely) < 1.2 * errors(freely)  # the leave-one-out errors choose
 
 
 def fitted(target: Any, count: int = 300) -> tuple[FusedMaps, ObjectFrames]:

@@ -30,7 +30,7 @@ _FREE = ("hidden_dim", "termination", "filter_frames", "long_filter_frames", "ro
 """Options that may differ from the preset's value."""
 _FILTERS = ("filter_frames", "long_filter_frames")
 """Options that give the lengths of the means, frames."""
-_RIDGES = ("ridge", "ridge_seen", "ridge_still", "ridge_other")
+_RIDGES = ("ridge", "ridge_other")
 _BEFORE = PLAIN | {"coordinates": "absolute"}
 """Values of options whose default was another one, or which were not there, when a checkpoint without them was saved."""
 
@@ -122,13 +122,9 @@ class HDRILConfig(SingleFrameConfig):
     """Weight of the predicted states beside that of the actions."""
     ridge: float = 1.0
     """Penalty on the squared weights of linear maps that are not fused (``state_skip``); they are solved, not trained."""
-    ridge_seen: float = 0.01
-    """Penalty on the weights of a fused map for what its frame sees: the hands, and what is carried. Light, because a few
-    demonstrations at the end of a movement differ by centimetres: a heavy one would draw a hand off the place that it goes to."""
-    ridge_still: float = 3.0
-    """The same for what stands still, as it is seen from the frame, and for where the hands are in the world."""
     ridge_other: float = 300.0
-    """The same for all that is not seen from the frame. A few demonstrations cannot tell which of some hundred numbers matter."""
+    """Penalty on the weights of a fused map for all that is not seen from its frame: a few demonstrations cannot tell which of
+    some hundred numbers matter. That on what is seen from there is found, see :data:`~lerobot_policy_hdril.fusion.RIDGES`."""
     min_std: float = 0.01
     """Floor of the deviations that normalise the data, m or dimensionless: numbers that hardly vary must not dominate."""
 

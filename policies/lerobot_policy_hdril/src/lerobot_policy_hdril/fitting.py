@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_policy_hdril.demonstrations import Demonstrations, Window
-from lerobot_policy_hdril.fusion import FusedMaps
+from lerobot_policy_hdril.fusion import RIDGES, FusedMaps
 from lerobot_policy_hdril.provenance import Origin, TrainingData, from_runs
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Te
             window.seen,
             window.target[..., : len(config.action_names)],
             window.mask,
-            (config.ridge_seen, config.ridge_still, config.ridge_other),
+            [(*ridge, config.ridge_other) for ridge in RIDGES],
             config.robust,
             noise_covariance(policy, window, features),
         )

@@ -12,6 +12,7 @@ frame, and heavy on all else.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import groupby
 
 import torch
@@ -24,6 +25,9 @@ from lerobot_policy_hdril.graph import node_of, pose_groups
 
 _FLOOR = 1e-7
 """Least variance, m² and of a quaternion's numbers: no frame is trusted further than a third of a millimetre."""
+RIDGES = ((1.0, 30.0), (0.1, 10.0), (0.01, 3.0))
+"""Penalties on what a frame sees, and on what stands still there. Each frame's maps have those with the least leave-one-out
+error: a dozen demonstrations need heavy ones, and with more of them these would draw a hand off the place that it goes to."""
 MOVED = 0.03
 """Distance from its longest mean, m, at which an object counts as just moved, in the median of the demonstrations."""
 SUPPORT = 0.5
@@ -210,7 +214,7 @@ class FusedMaps(nn.Module):
         seen: Tensor,
         action: Tensor,
         mask: Tensor,
-        ridge: tuple[float, float, float],
+        ridges: Sequence[tuple[float, float, float]],
         robust: bool,
         noise: Tensor,
     ) -> None:
@@ -226,7 +230,9 @@ class FusedMaps(nn.Module):
             seen: states at which windows start, and their means (N, V, S).
             action: (N, M, A).
             mask: (N, M), True where there is an action: the first frames of a row, as many as it has.
-            ridge: the penalties on what a frame sees, on what stands still there, and on all else.
+            ridges: penalties on what a frame sees, on what stands still there, and on all else. At each start, and for each
+                frame, those count that give the least leave-one-out error of the positions, noise included. The robust fit
+                takes the first.
             robust: leave out windows that are far off a first fit.
             noise: covariance (D, D) of noise on the features that the maps are to bear; 0 for none. The penalty grows as if every
                 window were seen with such noise, and the covariance of a frame's errors by what the noise adds to them.
@@ -244,9 +250,11 @@ class FusedMaps(nn.Module):
         start = start.clamp_max(last)
         for first in range(last + 1):
             rows = (start == first) & mask[:, 0]
-            least = F.pad(frames.penalties(frames.moved(seen[rows]), *ridge), (0, 1), value=FREE).diag_embed()
+            moved = frames.moved(seen[rows])
+            least = torch.stack([frames.penalties(moved, *penalty) for penalty in ridges])  # (C, 1 + V F, D)
+            least = F.pad(least, (0, 1), value=FREE).diag_embed()
             if robust:
-                rows = usual_windows(inputs, action[:, 0].double(), rows, least[0] + rows.sum() * noise)
+                rows = usual_windows(inputs, action[:, 0].double(), rows, least[0, 0] + rows.sum() * noise)
             counts, begin = (mask & rows[:, None]).sum(0).tolist(), 0
             for count, steps in groupby(counts):  # steps that the same rows have are solved together
                 end = begin + len(list(steps))
@@ -263,20 +271,22 @@ class FusedMaps(nn.Module):
         self, first: int, begin: int, x: Tensor, poses: Tensor, rest: Tensor, penalty: Tensor, noise: Tensor
     ) -> None:
         """Of the start ``first``, the steps from ``begin`` on: poses (1 + V F, N, m, G, 7) and the rest of the actions
-        (N, m, A - 7 G) from x (N, D + 1), with a penalty for each frame (1 + V F, D + 1, D + 1)."""
+        (N, m, A - 7 G) from x (N, D + 1), with penalties to choose from for each frame (C, 1 + V F, D + 1, D + 1)."""
         poses = _same_signs(poses)
         count, rows, steps, hands = poses.shape[:4]
         outputs = torch.cat([poses.flatten(3), rest.expand(count, *rest.shape)], dim=-1)  # (1 + V F, N, m, A)
         solution, errors = solve_ridge(x, outputs.flatten(2), penalty)
-        solution, errors = solution.unflatten(1, (steps, -1)), errors.unflatten(2, (steps, -1))
+        solution, errors = solution.unflatten(2, (steps, -1)), errors.unflatten(3, (steps, -1))
+        far = errors[..., : 7 * hands].unflatten(-1, (hands, 7))  # (C, 1 + V F, N, m, G, 7)
+        second = torch.einsum("cfnmgi,cfnmgj->cfmgij", far, far) / rows
+        weight = solution[:, :, :, : 7 * hands].unflatten(3, (hands, 7))
+        second += torch.einsum("cfmgid,cfmgjd->cfmgij", weight @ noise, weight)
+        error = second[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum((-3, -2, -1))  # (C, 1 + V F)
+        best, frames = error.argmin(0), torch.arange(count, device=error.device)
+        solution, second = solution[best, frames], second[best, frames]
         here = slice(begin, begin + steps)
         self.plain[first, here] = solution[0, :, 7 * hands :].to(self.plain)
-        weight = solution[:, :, : 7 * hands]  # (1 + V F, m, G 7, D + 1)
-        self.weight[:, first, here] = weight.to(self.weight)
-        far = errors[..., : 7 * hands].unflatten(-1, (hands, 7))  # (1 + V F, N, m, G, 7)
-        second = torch.einsum("fnmgi,fnmgj->fmgij", far, far) / rows
-        weight = weight.unflatten(2, (hands, 7))
-        second += torch.einsum("fmgid,fmgjd->fmgij", weight @ noise, weight)
+        self.weight[:, first, here] = solution[:, :, : 7 * hands].to(self.weight)
         position, turn = second[..., :3, :3], second[..., 3:, 3:].diagonal(dim1=-2, dim2=-1).sum(-1)
         precision = torch.linalg.inv(position + _FLOOR * torch.eye(3).to(second))
         self.precision[:, first, here] = precision.to(self.precision)
