@@ -557,7 +557,7 @@ def test_loss_that_is_not_finite(metadata) -> None:
         ({"rollout": "sideways"}, "closed_loop, open_loop"),
         ({"hidden_dim": 0}, "at least 1"),
         ({"experts": "piled"}, "auto, separate, stacked"),
-        ({"experts": "stacked", "decoder": "ode"}, "works with policy.decoder=gru"),
+        ({"experts": "stacked", "decoder": "ode"}, "needs policy.decoder=gru"),
         ({"replan_every": -1}, "0 \\(never\\)"),
         ({"coordinates": "polar"}, "absolute, relational"),
         ({"latent": "quantum"}, "deterministic, variational"),

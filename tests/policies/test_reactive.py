@@ -388,8 +388,76 @@ def test_what_has_moved_is_far_from_its_longest_mean_in_most_demonstrations() ->
     assert frames.moved(seen).tolist() == [False, True]
 
 
+def test_the_maps_are_those_of_the_penalties_that_serve_a_frame_best() -> None:
+    """Each start, step and frame, solved alone: penalties by what has moved, a choice by errors that the noise adds to."""
+    frames, draw = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION, 3).double(), generator(30)
+    ridges = [(3.0, 3.0, 3.0), (1e-3, 1.0, 30.0), (1e-3, 1e-3, 1e-3)]
+    seen = views(120, 40)
+    start, mask = torch.arange(120) % 2, torch.ones(120, 2, dtype=torch.bool)
+    seen[start == 0, 1:] = seen[start == 0, :1]  # nothing has moved
+    mask[::6, 1] = False  # at both starts a few last for a frame less; at the second, all reach the second frame
+    mask[1::6, 1] = True
+    target = at_cup(seen[:, 0])
+    target[:, :3] = 0.5 * target[:, :3] + 0.5 * seen[:, 0, :3] + 0.05 * torch.randn(120, 3, generator=draw)
+    openings = seen[:, 0, 21:] + 0.1 * torch.randn(120, 1, generator=draw)
+    action = torch.cat([target, openings], dim=-1)[:, None].repeat(1, 2, 1)
+    action[:, 1, :3] += 0.1 * torch.rand(120, 3, generator=draw)
+    features = frames.features(seen)
+    features = (features - features.mean(0)) / features.std(0)
+    noise = torch.diag(0.3 * torch.rand(frames.dim, generator=draw).double())
+    maps = FusedMaps(frames, 2, 2).double()
+    maps.fit(features, start, frames, seen, action, mask, ridges, False, noise)
+    x, noise = torch.cat([features, torch.ones(120, 1).double()], dim=-1), F.pad(noise, (0, 1, 0, 1))
+    poses, chosen = frames.targets(action, seen)[..., 0, :3], set()
+    for first in range(2):
+        rows = start == first
+        penalties = [frames.penalties(frames.moved(seen[rows]), *ridge) for ridge in ridges]
+        together = bool(mask[rows].all())
+        for frame in range(frames.count):
+            tried: list[list[tuple[float, Tensor, Tensor]]] = []
+            for step in range(2):
+                here = rows & mask[:, step]
+                tried.append([])
+                for penalty in penalties:
+                    full = torch.diag(F.pad(penalty[frame], (0, 1), value=1e-6)) + here.sum() * noise
+                    y = torch.cat([poses[frame, here, step], action[here, step, 7:]], dim=-1)
+                    solved, far = solve_ridge(x[here], y, full)
+                    spread = far.T @ far / here.sum() + solved @ noise @ solved.T
+                    tried[-1].append((float(spread[:3, :3].trace()), solved, spread))
+            for step in range(2):
+                scores = [sum(tried[s][c][0] for s in ((0, 1) if together else (step,))) for c in range(3)]
+                best = scores.index(min(scores))
+                chosen.add((frame, best))
+                _, solved, spread = tried[step][best]
+                torch.testing.assert_close(maps.weight[frame, first, step, :3], solved[:3])
+                expected = torch.linalg.inv(spread[:3, :3] + 1e-7 * torch.eye(3))
+                torch.testing.assert_close(maps.precision[frame, first, step, 0], expected)
+                if frame == 0:
+                    torch.testing.assert_close(maps.plain[first, step], solved[3:])
+    assert len({best for frame, best in chosen if frame}) > 1
+    assert {best for frame, best in chosen if not frame} != {best for frame, best in chosen if frame}
+
+
+def test_robust_maps_leave_out_what_is_far_off_at_each_start() -> None:
+    frames, draw = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION).double(), generator(31)
+    seen, start = scenes(400, 2)[:, None], torch.arange(400) % 2
+    action = torch.cat([at_place(seen[:, 0]), torch.zeros(400, 1).double()], dim=-1)[:, None]
+    action[..., :3] += 1e-3 * torch.randn(400, 1, 3, generator=draw) + 0.2 * start[:, None, None]
+    wrong = action.clone()
+    wrong[::15, :, :3] += 0.5
+    mask, noise = torch.ones(400, 1, dtype=torch.bool), torch.zeros(frames.dim, frames.dim)
+    ridges = [(1e-3, 1e-3, 1e-3), (1e6, 1e6, 1e6)]
+    places = []
+    for given, robust in ((action, False), (wrong, False), (wrong, True)):
+        maps = FusedMaps(frames, 2, 1).double()
+        maps.fit(frames.features(seen), start, frames, seen, given, mask, ridges, robust, noise)
+        places.append(maps(frames.features(seen), start, frames, frames.origins(seen))[:, 0, :3])
+    assert (places[1] - places[0]).norm(dim=-1).mean() > 0.01
+    torch.testing.assert_close(places[2], places[0], atol=2e-3, rtol=0)
+
+
 @pytest.mark.parametrize(("late", "alone"), [(50, True), (49, False)])
-def test_a_start_that_few_executions_reach_has_the_maps_of_the_one_before(late: int, alone: bool) -> None:
+def test_starts_that_few_executions_reach_share_maps_with_the_one_before(late: int, alone: bool) -> None:
     frames = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION).double()
     maps, seen = FusedMaps(frames, 4, 1).double(), scenes(200 + late, 2)[:, None]
     start = torch.tensor([0] * 100 + [1] * 100 + [2] * late)

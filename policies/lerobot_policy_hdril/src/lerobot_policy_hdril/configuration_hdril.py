@@ -86,8 +86,8 @@ class HDRILConfig(SingleFrameConfig):
     """One dynamics model per primitive (the paper's Multi), or one for all that is told the primitive. Fused linear maps are one
     for each in any case."""
     decoder: Decoder = "linear"
-    """``linear``: no network, the linear maps predict alone. ``gru``: a network learns what they leave, or all; the default where
-    coordinates are not fused. ``ode``: the paper's other decoder."""
+    """``linear``: no network, the linear maps predict alone. ``gru``: a network learns what they leave, or all; without a preset,
+    the default where coordinates are not fused. ``ode``: the paper's other decoder."""
     coordinates: Coordinates = "fused"
     """Of the dynamics. ``relational``: hands and predictions in the frame of the first object, as it stands when a plan is
     made. ``fused``: the linear maps predict the next actions in the world's and every object's frame, and the predictions
@@ -123,8 +123,8 @@ class HDRILConfig(SingleFrameConfig):
     ridge: float = 1.0
     """Penalty on the squared weights of linear maps that are not fused (``state_skip``); they are solved, not trained."""
     ridge_other: float = 300.0
-    """Penalty on the weights of a fused map for all that is not seen from its frame: a few demonstrations cannot tell which of
-    some hundred numbers matter. That on what is seen from there is found, see :data:`~lerobot_policy_hdril.fusion.RIDGES`."""
+    """Penalty on the weights of a fused map for all that :data:`~lerobot_policy_hdril.fusion.RIDGES` are not for, which is most:
+    a few demonstrations cannot tell which of some hundred numbers matter."""
     min_std: float = 0.01
     """Floor of the deviations that normalise the data, m or dimensionless: numbers that hardly vary must not dominate."""
 
@@ -209,7 +209,7 @@ class HDRILConfig(SingleFrameConfig):
         if self.latent == "deterministic" and (self.kl_weight or self.samples):
             raise ValueError("policy.kl_weight and policy.samples are for policy.latent=variational")
         if self.experts == "stacked" and self.decoder != "gru":
-            raise ValueError(f"policy.experts=stacked works with policy.decoder=gru; got {self.decoder}")
+            raise ValueError(f"policy.experts=stacked needs policy.decoder=gru; got {self.decoder}")
         if self.coordinates == "fused":
             self._check_fused()
         if self.decoder == "linear" and not (self.state_skip and self.per_primitive and self.latent == "deterministic"):

@@ -147,7 +147,7 @@ class PrimitiveDynamics(nn.Module):
 
     f_t are as many means of the last states as ``means`` says. ``context`` c is empty for a model of one primitive, and says
     which primitive it is for a model of all. L is there with ``state_skip``; with ``residual``, other maps stand in for it.
-    Without ``variational`` there is no v, and z = m. With the decoder ``linear`` there is nothing but L, or the other maps.
+    Without ``variational`` there is no v, and z = m. With the decoder ``linear`` there is nothing but L.
     """
 
     def __init__(
@@ -215,9 +215,8 @@ class PrimitiveDynamics(nn.Module):
             Normalised actions and states (B, M, A + S), and KL(N(m, e^v) || N(0, 1)) (B,) in nats, 0 if deterministic.
         """
         if not self.has_network:
-            output = normalised.new_zeros(*steps.shape, self.out_dim)
-            mapped = output if self.state_skip is None else self.state_skip(linear, steps)
-            return mapped, output.new_zeros(len(output))
+            assert self.state_skip is not None  # fused maps alone are called without this
+            return self.state_skip(linear, steps), normalised.new_zeros(len(normalised))
         seen = self.graph(normalised, raw)
         if stacked:
             encoder, start = self.encoder, seen.new_zeros(len(seen), self.encoder.hidden_size)

@@ -24,7 +24,7 @@ class Attention:
     nodes: list[str]
     primitives: list[str]  # (B,), what each episode plays
     planner: Tensor  # (B, N, N)
-    dynamics: Tensor  # (B, N, N), of the model of the primitive that plays
+    dynamics: Tensor  # (B, N, N), of the model of the primitive that plays; linear maps attend to nobody, and it is the identity
 
     def received(self, planner: bool = False) -> dict[str, Tensor]:
         """For every hand and object, the share (B,) of the dynamics model's attention that goes to it, or of the planner's, mean

@@ -26,12 +26,14 @@ from lerobot_policy_hdril.graph import node_of, pose_groups
 _FLOOR = 1e-7
 """Least variance, m² and of a quaternion's numbers: no frame is trusted further than a third of a millimetre."""
 RIDGES = ((1.0, 30.0), (0.1, 10.0), (0.01, 3.0))
-"""Penalties on what a frame sees, and on what stands still there. Each frame's maps have those with the least leave-one-out
-error: a dozen demonstrations need heavy ones, and with more of them these would draw a hand off the place that it goes to."""
+"""Penalties on what a frame sees, and on what stands still there, the heaviest first. Each frame's map has those with the least
+leave-one-out error: a dozen demonstrations need heavy ones, and with more of them these would draw a hand off the place that it
+goes to."""
 MOVED = 0.03
-"""Distance from its longest mean, m, at which an object counts as just moved, in the median of the demonstrations."""
+"""Distance from its longest mean, m, at which an object counts as just moved, in the median of the demonstrations. It goes with a
+mean of 24 frames at 10 frames a second; without a mean, nothing counts as moved."""
 SUPPORT = 0.5
-"""Share of a primitive's executions that must reach a start for it to have maps of its own."""
+"""Share of a primitive's executions that must reach a start for it to have a map to itself."""
 HAND, NO_POSE = -1, -2  # owners of numbers that are no object's with a pose
 
 
@@ -153,9 +155,9 @@ class ObjectFrames(nn.Module):
         """The penalty of each frame's map on each feature (1 + V F, D): one of the three.
 
         ``seen`` for the hands as they are now and what has moved, as they are seen from the frame; for the means of the hands
-        too, if something has moved, because they tell how it is held; and for what is no pose, such as an opening or a size, of
-        the hands, of what has moved and of the frame's own object. ``still`` for what stands still, as seen from the frame, and
-        for where the hands are in the world. ``other`` for all else.
+        too, if something has moved, because they tell how it is held; and for what is no pose in the present state, such as an
+        opening or a size, of the hands, of what has moved, of the frame's own object and of what has no pose at all. ``still``
+        for what stands still, as seen from the frame, and for where the hands are in the world. ``other`` for all else.
 
         Args:
             moved: which objects have (F,).
@@ -220,8 +222,9 @@ class FusedMaps(nn.Module):
     ) -> None:
         """Solve the maps, in float64, see :func:`~lerobot_policy_hdril.dynamics.solve_ridge`.
 
-        Starts that less than half of the executions reach have the maps of the last one before them: there are too few windows
-        to fit so many numbers, and those that last so long are the odd ones.
+        Starts that less than half of the executions reach share the maps of the last one that enough reach, which are fitted to
+        the windows of all of them: few windows cannot fit so many numbers. Where an execution has several windows there, the
+        leave-one-out errors are too small, because its other windows stay.
 
         Args:
             features: normalised features (N, D).
@@ -230,9 +233,9 @@ class FusedMaps(nn.Module):
             seen: states at which windows start, and their means (N, V, S).
             action: (N, M, A).
             mask: (N, M), True where there is an action: the first frames of a row, as many as it has.
-            ridges: penalties on what a frame sees, on what stands still there, and on all else. At each start, and for each
-                frame, those count that give the least leave-one-out error of the positions, noise included. The robust fit
-                takes the first.
+            ridges: penalties on what a frame sees, on what stands still there, and on all else. For each frame, and for the
+                steps that are solved together, those count that give the least leave-one-out error of the hands' positions,
+                noise included. What is no pose has the world's. The robust fit takes the first.
             robust: leave out windows that are far off a first fit.
             noise: covariance (D, D) of noise on the features that the maps are to bear; 0 for none. The penalty grows as if every
                 window were seen with such noise, and the covariance of a frame's errors by what the noise adds to them.
@@ -275,7 +278,10 @@ class FusedMaps(nn.Module):
         poses = _same_signs(poses)
         count, rows, steps, hands = poses.shape[:4]
         outputs = torch.cat([poses.flatten(3), rest.expand(count, *rest.shape)], dim=-1)  # (1 + V F, N, m, A)
-        solution, errors = solve_ridge(x, outputs.flatten(2), penalty)
+        # One after the other: of thousands of windows, all together would take gigabytes.
+        solution, errors = map(
+            torch.stack, zip(*(solve_ridge(x, outputs.flatten(2), one) for one in penalty), strict=True)
+        )
         solution, errors = solution.unflatten(2, (steps, -1)), errors.unflatten(3, (steps, -1))
         far = errors[..., : 7 * hands].unflatten(-1, (hands, 7))  # (C, 1 + V F, N, m, G, 7)
         second = torch.einsum("cfnmgi,cfnmgj->cfmgij", far, far) / rows
