@@ -21,6 +21,10 @@ cp "$last" "{folder}/$number.slurm"
 echo "$@" > "{folder}/$number.arguments"
 echo "Submitted batch job $number"
 """
+SCONTROL = """#!/bin/sh
+# scontrol show hostnames LIST, which a job asks for: here there is one node.
+echo "$3"
+"""
 
 
 @dataclass(frozen=True)
@@ -55,16 +59,18 @@ class Job:
 
 
 class FakeSlurm:
-    """Stands for a cluster whose ``sbatch`` is on the PATH."""
+    """Stands for a cluster whose ``sbatch`` and ``scontrol`` are on the PATH."""
 
     def __init__(self, folder: Path, patch: pytest.MonkeyPatch) -> None:
         self._kept = folder / "jobs"
         self._kept.mkdir(parents=True)
-        self.program = program = folder / "bin" / "sbatch"
-        program.parent.mkdir()
-        program.write_text(SBATCH.format(folder=self._kept))
-        program.chmod(0o755)
-        patch.setenv("PATH", f"{program.parent}{os.pathsep}{os.environ['PATH']}")
+        self.program = folder / "bin" / "sbatch"
+        self.program.parent.mkdir()
+        for name, script in (("sbatch", SBATCH.format(folder=self._kept)), ("scontrol", SCONTROL)):
+            program = self.program.with_name(name)
+            program.write_text(script)
+            program.chmod(0o755)
+        patch.setenv("PATH", f"{self.program.parent}{os.pathsep}{os.environ['PATH']}")
 
     @property
     def jobs(self) -> list[Job]:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 from unittest.mock import patch
 
 from hdril.cli.common import run
@@ -213,8 +213,8 @@ def _samples_per_second(policy, batch: dict, steps: int, mixed: bool = False) ->
 
 
 def bench_policies(root: Path) -> list[Figure]:
-    """HDR-IL's training against ACT's, both at LeRobot's defaults, and what its own choices (models called one by one, float32)
-    gain or cost; one core."""
+    """HDR-IL's training against ACT's, both at LeRobot's defaults, and what the choices for its networks (called one by one,
+    float32) gain or cost; one core."""
     import torch
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
     from lerobot.policies.act.configuration_act import ACTConfig
@@ -228,11 +228,12 @@ def bench_policies(root: Path) -> list[Figure]:
     def frames(count: int) -> dict[str, torch.Tensor]:
         return {"index": torch.randint(metadata.total_frames, (count,), generator=generator)}
 
-    def hdril(how: Literal["separate", "stacked"], mixed: bool = False) -> float:
-        config = HDRILConfig(device="cpu", push_to_hub=False, experts=how)
+    def hdril(mixed: bool = False, **values: Any) -> float:
+        config = HDRILConfig(device="cpu", push_to_hub=False, **values)
         return _samples_per_second(make_policy(config, ds_meta=metadata), frames(64), 5, mixed)
 
-    separate, stacked, mixed = hdril("separate"), hdril("stacked"), hdril("separate", mixed=True)
+    ours, separate = hdril(), hdril(decoder="gru", experts="separate")
+    stacked, mixed = hdril(decoder="gru", experts="stacked"), hdril(mixed=True, decoder="gru", experts="separate")
     act_config = ACTConfig(device="cpu", push_to_hub=False)
     act = make_policy(act_config, ds_meta=metadata)
     batch = frames(8)
@@ -242,7 +243,7 @@ def bench_policies(root: Path) -> list[Figure]:
     batch["action_is_pad"] = torch.zeros(8, act_config.chunk_size, dtype=torch.bool)
     theirs = _samples_per_second(act, batch, 3)
     return [
-        Figure("training, samples per second against ACT's", separate / theirs, 30.0, True, "times"),
+        Figure("training, samples per second against ACT's", ours / theirs, 30.0, True, "times"),
         Figure("the models one by one against stacked", separate / stacked, 0.9, True, "times"),
         Figure("training in float32 against mixed precision", separate / mixed, 0.9, True, "times"),
     ]
