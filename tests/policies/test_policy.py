@@ -359,6 +359,23 @@ def test_a_card_says_when_the_policy_looks(values, looks: str, metadata) -> None
         assert f"`{getattr(policy.config, name)}`" in text.partition(f"| `{name}`")[2].partition("\n")[0]
 
 
+@pytest.mark.parametrize(
+    ("values", "predicts"),
+    [
+        (
+            {"preset": "hdril_reactive"},
+            "linear maps in the frames of all objects, fused by their precision, predict its",
+        ),
+        ({"preset": "network_reactive"}, "a graph-recurrent model of each primitive what they leave, and the policy"),
+        ({"preset": "linear"}, "next primitive, linear maps predict its trajectory"),
+        ({"preset": "hdril"}, "a graph-recurrent dynamics model of each primitive predicts its trajectory"),
+        ({"preset": "res"}, "a graph-recurrent dynamics model of all primitives predicts its trajectory"),
+    ],
+)
+def test_a_card_says_what_predicts(values, predicts: str, metadata) -> None:
+    assert predicts in str(model_card(build(metadata, **values).config, "user/set", None, None, None, metadata))
+
+
 def test_preset_that_is_unknown_or_contradicted() -> None:
     with pytest.raises(ValueError, match=r"unknown policy\.preset 'gat'; choose from: gru_gru, res, "):
         HDRILConfig(device="cpu", push_to_hub=False, preset="gat")

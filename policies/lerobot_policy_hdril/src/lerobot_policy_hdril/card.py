@@ -41,6 +41,16 @@ def simulated_task(config: HDRILConfig, dataset_meta: LeRobotDatasetMetadata | N
     return None if recipe is None else recipe.get("task")
 
 
+def _predicts(config: HDRILConfig) -> str:
+    which = "of each primitive" if config.per_primitive else "of all primitives"
+    if config.coordinates == "fused":
+        maps = "linear maps in the frames of all objects, fused by their precision, predict its trajectory"
+        return maps if config.decoder == "linear" else f"{maps}, a graph-recurrent model {which} what they leave"
+    if config.decoder == "linear":
+        return "linear maps predict its trajectory"
+    return f"a graph-recurrent dynamics model {which} predicts its trajectory"
+
+
 def _looks(config: HDRILConfig) -> str:
     every = config.replan_every
     if config.rollout == "open_loop":
@@ -76,8 +86,7 @@ def model_card(
 # HDR-IL: {task or dataset_repo_id}
 
 Hierarchical deep relational imitation learning ([Xie et al., NeurIPS 2020](https://arxiv.org/abs/2010.05134)) as a
-LeRobot policy: a planner picks the next primitive, one graph-recurrent dynamics model per primitive predicts its
-trajectory, and the policy {_looks(config)}.
+LeRobot policy: a planner picks the next primitive, {_predicts(config)}, and the policy {_looks(config)}.
 
 Weights are safetensors; the policy's code comes with the Python package `lerobot_policy_hdril`, and no remote code is run.
 
