@@ -26,9 +26,11 @@ from lerobot_policy_hdril.graph import node_of, pose_groups
 _FLOOR = 1e-7
 """Least variance, m² and of a quaternion's numbers: no frame is trusted further than a third of a millimetre."""
 RIDGES = ((1.0, 30.0), (0.1, 10.0), (0.01, 3.0))
-"""Penalties on what a frame sees, and on what stands still there, the heaviest first. Each frame's map has those with the least
-leave-one-out error: a dozen demonstrations need heavy ones, and with more of them these would draw a hand off the place that it
-goes to."""
+"""Penalties on what a frame sees, and on what stands still there, the heaviest first. Each frame's map has the heaviest whose
+leave-one-out error is not clearly above the least: a light one follows noise, and a heavy one may draw a hand off the place that
+it goes to."""
+CLEARLY = 2.0
+"""Times that a mean squared leave-one-out error must be above the least one for a penalty to be too heavy."""
 MOVED = 0.03
 """Distance from its longest mean, m, at which an object counts as just moved, in the median of the demonstrations. It goes with a
 mean of 24 frames at 10 frames a second; without a mean, nothing counts as moved."""
@@ -234,8 +236,9 @@ class FusedMaps(nn.Module):
             action: (N, M, A).
             mask: (N, M), True where there is an action: the first frames of a row, as many as it has.
             ridges: penalties on what a frame sees, on what stands still there, and on all else. For each frame, and for the
-                steps that are solved together, those count that give the least leave-one-out error of the hands' positions,
-                noise included. What is no pose has the world's. The robust fit takes the first.
+                steps that are solved together, the first ones count whose mean squared leave-one-out error of the hands'
+                positions, noise included, is at most :data:`CLEARLY` times the least. What is no pose has the world's. The
+                robust fit takes the first.
             robust: leave out windows that are far off a first fit.
             noise: covariance (D, D) of noise on the features that the maps are to bear; 0 for none. The penalty grows as if every
                 window were seen with such noise, and the covariance of a frame's errors by what the noise adds to them.
@@ -288,7 +291,8 @@ class FusedMaps(nn.Module):
         weight = solution[:, :, :, : 7 * hands].unflatten(3, (hands, 7))
         second += torch.einsum("cfmgid,cfmgjd->cfmgij", weight @ noise, weight)
         error = second[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum((-3, -2, -1))  # (C, 1 + V F)
-        best, frames = error.argmin(0), torch.arange(count, device=error.device)
+        near = error <= CLEARLY * error.min(0).values
+        best, frames = near.int().argmax(0), torch.arange(count, device=error.device)  # the first of them
         solution, second = solution[best, frames], second[best, frames]
         here = slice(begin, begin + steps)
         self.plain[first, here] = solution[0, :, 7 * hands :].to(self.plain)
