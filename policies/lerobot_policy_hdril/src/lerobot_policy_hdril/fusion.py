@@ -27,8 +27,8 @@ _FLOOR = 1e-7
 """Least variance, m² and of a quaternion's numbers: no frame is trusted further than a third of a millimetre."""
 RIDGES = ((1.0, 30.0), (0.1, 10.0), (0.01, 3.0))
 """Penalties on what a frame sees, and on what stands still there, the heaviest first. Each frame's map has the heaviest whose
-leave-one-out error is not clearly above the least: a light one follows noise, and a heavy one may draw a hand off the place that
-it goes to."""
+leave-one-out error is not clearly above the least: a light one may follow noise, and a heavy one may draw a hand off the place
+that it goes to."""
 CLEARLY = 2.0
 """Times that a mean squared leave-one-out error must be above the least one for a penalty to be too heavy."""
 MOVED = 0.03
@@ -258,33 +258,32 @@ class FusedMaps(nn.Module):
             rows = (start == first) & mask[:, 0]
             moved = frames.moved(seen[rows])
             least = torch.stack([frames.penalties(moved, *penalty) for penalty in ridges])  # (C, 1 + V F, D)
-            least = F.pad(least, (0, 1), value=FREE).diag_embed()
+            least = F.pad(least, (0, 1), value=FREE)
             if robust:
-                rows = usual_windows(inputs, action[:, 0].double(), rows, least[0, 0] + rows.sum() * noise)
+                rows = usual_windows(inputs, action[:, 0].double(), rows, least[0, 0].diag() + rows.sum() * noise)
             counts, begin = (mask & rows[:, None]).sum(0).tolist(), 0
             for count, steps in groupby(counts):  # steps that the same rows have are solved together
                 end = begin + len(list(steps))
                 if count:
                     here = rows & mask[:, begin]
                     targets = poses[:, here, begin:end], rest[here, begin:end]
-                    self._fit_steps(first, begin, inputs[here], *targets, least + count * noise, noise)
+                    self._fit_steps(first, begin, inputs[here], *targets, least, noise)
                 begin = end
         for buffer, starts in ((self.weight, 1), (self.plain, 0), (self.precision, 1), (self.variance, 1)):
             by_start = buffer.movedim(starts, 0)
             by_start[last + 1 :] = by_start[last]
 
     def _fit_steps(
-        self, first: int, begin: int, x: Tensor, poses: Tensor, rest: Tensor, penalty: Tensor, noise: Tensor
+        self, first: int, begin: int, x: Tensor, poses: Tensor, rest: Tensor, least: Tensor, noise: Tensor
     ) -> None:
         """Of the start ``first``, the steps from ``begin`` on: poses (1 + V F, N, m, G, 7) and the rest of the actions
-        (N, m, A - 7 G) from x (N, D + 1), with penalties to choose from for each frame (C, 1 + V F, D + 1, D + 1)."""
+        (N, m, A - 7 G) from x (N, D + 1), with penalties to choose from for each frame (C, 1 + V F, D + 1)."""
         poses = _same_signs(poses)
         count, rows, steps, hands = poses.shape[:4]
         outputs = torch.cat([poses.flatten(3), rest.expand(count, *rest.shape)], dim=-1)  # (1 + V F, N, m, A)
         # One after the other: of thousands of windows, all together would take gigabytes.
-        solution, errors = map(
-            torch.stack, zip(*(solve_ridge(x, outputs.flatten(2), one) for one in penalty), strict=True)
-        )
+        solved = [solve_ridge(x, outputs.flatten(2), one.diag_embed() + rows * noise) for one in least]
+        solution, errors = map(torch.stack, zip(*solved, strict=True))
         solution, errors = solution.unflatten(2, (steps, -1)), errors.unflatten(3, (steps, -1))
         far = errors[..., : 7 * hands].unflatten(-1, (hands, 7))  # (C, 1 + V F, N, m, G, 7)
         second = torch.einsum("cfnmgi,cfnmgj->cfmgij", far, far) / rows
