@@ -26,7 +26,10 @@ Experts = Literal["auto", "separate", "stacked"]
 Termination = Literal["length", "learned"]
 
 
-_FREE = ("hidden_dim", "termination", "filter_frames", "long_filter_frames", "robust", "hand_noise", "replan_every")
+_FREE = (
+    "hidden_dim", "termination", "filter_frames", "long_filter_frames", "robust", "hand_noise", "planner_dropout",
+    "planner_scale", "replan_every",
+)  # fmt: skip
 """Options that may differ from the preset's value."""
 _FILTERS = ("filter_frames", "long_filter_frames")
 """Options that give the lengths of the means, frames."""
@@ -55,9 +58,9 @@ class HDRILConfig(SingleFrameConfig):
     # Variant.
     preset: str = ""
     """Name of a model in :data:`~lerobot_policy_hdril.presets.PRESETS`, which then decides the values of this group, and
-    ``hidden_dim``. ``hidden_dim``, ``termination``, ``filter_frames``, ``long_filter_frames``, ``robust``, ``hand_noise`` and
-    ``replan_every`` may be given nevertheless, where the model has a use for them. Empty to set them one by one. Once the
-    policy has learned it is a name only."""
+    ``hidden_dim``. ``hidden_dim``, ``termination``, ``filter_frames``, ``long_filter_frames``, ``robust``, ``hand_noise``,
+    ``planner_dropout``, ``planner_scale`` and ``replan_every`` may be given nevertheless, where the model has a use for them.
+    Empty to set them one by one. Once the policy has learned it is a name only."""
     interaction: Interaction = "object"
     """Graph attention: ``none``; ``scalar``, the paper's node per number of the state; ``object``, a node per object."""
     skip: bool = True
@@ -82,6 +85,11 @@ class HDRILConfig(SingleFrameConfig):
     """When a primitive is over. ``length``: after its shortest recorded length, as soon as the planner prefers another.
     ``learned``: the planner decides at every frame whether it goes on or one begins, maybe the same again; for
     demonstrations in which primitives are broken off and repeated."""
+    planner_dropout: float = 0.2
+    """Share of the planner's inner numbers that training leaves out, so that it learns more from few demonstrations."""
+    planner_scale: float = 0.05
+    """The planner sees each position p as asinh(p / planner_scale), too, m; 0: not. For ``interaction=object`` alone; it is 0
+    with others."""
     per_primitive: bool = True
     """One dynamics model per primitive (the paper's Multi), or one for all that is told the primitive. Fused linear maps are one
     for each in any case."""
@@ -183,6 +191,8 @@ class HDRILConfig(SingleFrameConfig):
             self._apply_preset()
         if self.coordinates != "fused" and "hand_noise" not in self._given:
             self.hand_noise = 0.0
+        if self.interaction != "object" and "planner_scale" not in self._given:
+            self.planner_scale = 0.0
         if self.coordinates != "fused" and "decoder" not in self._given and not self.preset:
             self.decoder = "gru"
         if not self.state_skip:
@@ -227,6 +237,13 @@ class HDRILConfig(SingleFrameConfig):
             raise ValueError(
                 "policy.hand_noise must not be negative, and is for policy.coordinates=fused; "
                 f"got {self.hand_noise} and {self.coordinates}"
+            )
+        if not 0.0 <= self.planner_dropout < 1.0:
+            raise ValueError(f"policy.planner_dropout must be from 0 to less than 1, got {self.planner_dropout}")
+        if self.planner_scale < 0 or (self.planner_scale and self.interaction != "object"):
+            raise ValueError(
+                "policy.planner_scale must not be negative, and is for policy.interaction=object; "
+                f"got {self.planner_scale} and {self.interaction}"
             )
         if self.replan_every < 0:
             raise ValueError(f"policy.replan_every must be 0 (never) or more frames, got {self.replan_every}")

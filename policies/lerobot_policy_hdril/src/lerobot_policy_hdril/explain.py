@@ -60,7 +60,7 @@ def attend(policy: HDRILPolicy, playback: PlaybackState) -> Attention:
     return Attention(
         nodes=list(policy.planner.graph.node_names),
         primitives=[policy.config.primitives[k] for k in playing],
-        planner=policy.planner.graph.attention(policy.normalise(seen), seen),
+        planner=policy.planner.attention(policy.normalise(seen), seen),
         dynamics=torch.cat(rows),
     )
 

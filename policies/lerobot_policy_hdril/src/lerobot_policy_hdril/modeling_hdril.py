@@ -131,6 +131,8 @@ class HDRILPolicy(PreTrainedPolicy):
             config.planner_hidden_dim,
             config.node_dim,
             steps=self.capacity if config.termination == "learned" else 0,
+            scale=config.planner_scale,
+            dropout=config.planner_dropout,
         )
         self.relational = None
         if config.coordinates == "relational":
@@ -232,9 +234,10 @@ class HDRILPolicy(PreTrainedPolicy):
             self._learn_from(self._demonstrations, rows)
         self._check_learned()
         window = self._demonstrations.window(rows, self.config.trained_replan_every, self.ahead)
-        dynamics_loss, divergence = self.dynamics_loss(window, self._noise_of(rows))
+        noise = self._noise_of(rows)
+        dynamics_loss, divergence = self.dynamics_loss(window, noise)
         history = self._demonstrations.history(rows[: self.config.planner_batch_size])
-        planner_loss, accuracy = self.planner_loss(history, window)
+        planner_loss, accuracy = self.planner_loss(history, window, noise)
         loss = dynamics_loss + planner_loss
         if self.config.kl_weight:
             loss = loss + self.config.kl_weight * divergence
@@ -264,11 +267,12 @@ class HDRILPolicy(PreTrainedPolicy):
             raise RuntimeError("this policy has learned nothing yet: train it with lerobot-train")
 
     def _noise_of(self, rows: Tensor) -> torch.Generator | None:
-        """What draws the noise of the hands for a batch of these rows (B,); None where there is no noise.
+        """What draws the noise of the hands and what the planner leaves out for a batch of these rows (B,); None where nothing
+        is drawn.
 
         Seeded by the batch: a resumed run brings the same batches, but its new loader has drawn from PyTorch's own generator.
         """
-        if self.hand_noise is None or not self.training:
+        if not self.training or (self.hand_noise is None and not self.config.planner_dropout):
             return None
         return torch.Generator(rows.device).manual_seed(zlib.crc32(rows.cpu().numpy().tobytes()))
 
@@ -298,15 +302,17 @@ class HDRILPolicy(PreTrainedPolicy):
         ahead = torch.arange(self.ahead, device=elapsed.device)
         return (elapsed[:, None] + ahead).clamp_max(self.capacity - 1)
 
-    def planner_loss(self, history: History, window: Window) -> tuple[Tensor, float]:
+    def planner_loss(
+        self, history: History, window: Window, noise: torch.Generator | None = None
+    ) -> tuple[Tensor, float]:
         """Cross-entropy over all frames of the episodes, and the share of them at which the most probable answer is the
         right one; plus cross-entropy over the frames at which windows start, each seen without what was before it. That
-        is all that :meth:`predict_action_chunk` has where no episode runs."""
-        told = (history.playing, history.elapsed) if self.planner.steps else ()
+        is all that :meth:`predict_action_chunk` has where no episode runs. ``noise`` draws what the planner leaves out."""
+        told = (history.playing, history.elapsed) if self.planner.steps else (None, None)
         nothing = torch.zeros_like(window.primitive)[:, None]
-        alone_told = (nothing + len(self.config.primitives), nothing) if self.planner.steps else ()
-        logits, _ = self.planner(self.normalise(history.state), history.state, None, *told)
-        alone, _ = self.planner(self.normalise(window.state)[:, None], window.state[:, None], None, *alone_told)
+        alone_told = (nothing + len(self.config.primitives), nothing) if self.planner.steps else (None, None)
+        logits, _ = self.planner(self.normalise(history.state), history.state, None, *told, noise)
+        alone, _ = self.planner(self.normalise(window.state)[:, None], window.state[:, None], None, *alone_told, noise)
         right, first = history.primitive, window.primitive
         if self.planner.steps:  # 0 is that the primitive goes on
             right, first = torch.where(history.begins, right + 1, 0), first + 1

@@ -13,6 +13,7 @@ _TRAINING = {
     "kl_weight",
     "state_loss_weight",
     "planner_batch_size",
+    "planner_dropout",
     "subtask_key",
     "optimizer_lr",
     "optimizer_weight_decay",

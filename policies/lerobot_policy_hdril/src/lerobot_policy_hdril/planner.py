@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_policy_hdril.decoders import run_gru
+from lerobot_policy_hdril.graph import pose_groups
 from lerobot_policy_hdril.interaction import make_interaction
 
 
@@ -17,15 +18,35 @@ class Planner(nn.Module):
     With ``steps``, the head is told as well which primitive plays and how many of its frames are over, and decides whether
     that goes on or one begins: the termination of an option (Sutton, Precup and Singh 1999).
 
+    With ``scale``, it sees each position p a second time, as asinh(p / scale). Beside numbers that are normalised by how far an
+    object gets, it is what tells a few centimetres at the robot's middle, where it matters which hand is nearer.
+
+    With ``dropout``, training leaves out that share of the embedded states' numbers and of the hidden states', the same ones at
+    all frames of an episode (Gal and Ghahramani, NeurIPS 2016).
+
     Args:
         steps: frames of the longest primitive; 0 for a head that sees the states alone.
+        scale: m; 0 for a planner that sees the normalised state alone.
+        dropout: share of numbers, 0 to less than 1.
     """
 
     def __init__(
-        self, names: list[str], primitives: int, interaction: str, hidden_dim: int, node_dim: int, steps: int = 0
+        self,
+        names: list[str],
+        primitives: int,
+        interaction: str,
+        hidden_dim: int,
+        node_dim: int,
+        steps: int = 0,
+        scale: float = 0.0,
+        dropout: float = 0.0,
     ) -> None:
         super().__init__()
-        self.graph = make_interaction(interaction, names, node_dim)
+        positions = [i for pose in pose_groups(names) for i in pose[:3]] if scale else []
+        # A part of a pose's name that is no axis: the numbers join the node of their object, and the pose stays what it is.
+        self.graph = make_interaction(interaction, [*names, *(f"{names[i]}_scaled" for i in positions)], node_dim)
+        self.register_buffer("positions", torch.tensor(positions, dtype=torch.long), persistent=False)
+        self.scale, self.dropout = scale, dropout
         self.gru = nn.GRU(self.graph.out_dim, hidden_dim, batch_first=True)
         self.steps = steps
         told, answers = (primitives + 1 + steps + 1, primitives + 1) if steps else (0, primitives)
@@ -34,8 +55,26 @@ class Planner(nn.Module):
         self.register_buffer("which", torch.eye(primitives + 1), persistent=False)
         self.register_buffer("when", torch.eye(steps + 1), persistent=False)
 
+    positions: Tensor  # columns of the state
     which: Tensor  # (K + 1, K + 1)
     when: Tensor  # (steps + 1, steps + 1)
+
+    def attention(self, normalised: Tensor, raw: Tensor) -> Tensor:
+        """Attention weights (B, N, N) of states (B, S)."""
+        return self.graph.attention(self._seen(normalised, raw), raw)
+
+    def _seen(self, normalised: Tensor, raw: Tensor) -> Tensor:
+        """What the graph sees of states (..., S)."""
+        if not len(self.positions):
+            return normalised
+        return torch.cat([normalised, torch.asinh(raw[..., self.positions] / self.scale)], dim=-1)
+
+    def _drop(self, values: Tensor, noise: torch.Generator | None) -> Tensor:
+        """Values (B, T, D) without some of the D, others in each row."""
+        if noise is None or not self.dropout:
+            return values
+        drawn = torch.rand(len(values), 1, values.shape[-1], generator=noise, dtype=values.dtype, device=values.device)
+        return values * (drawn >= self.dropout) / (1.0 - self.dropout)
 
     def forward(
         self,
@@ -44,6 +83,7 @@ class Planner(nn.Module):
         memory: Tensor | None = None,
         playing: Tensor | None = None,
         elapsed: Tensor | None = None,
+        noise: torch.Generator | None = None,
     ) -> tuple[Tensor, Tensor]:
         """States (B, T, S), and the memory (1, B, H) of what was before them, to logits and the new memory.
 
@@ -53,10 +93,13 @@ class Planner(nn.Module):
         Args:
             playing: the primitive at the frame before (B, T), K where there is none.
             elapsed: how many of its frames are over (B, T).
+            noise: draws what is left out; without it, nothing is.
         """
         batch, time, _ = normalised.shape
-        nodes = self.graph(normalised.flatten(0, 1), raw.flatten(0, 1)).unflatten(0, (batch, time))
+        seen, flat = self._seen(normalised, raw).flatten(0, 1), raw.flatten(0, 1)
+        nodes = self._drop(self.graph(seen, flat).unflatten(0, (batch, time)), noise)
         hidden, last = run_gru(self.gru, nodes, memory)
+        hidden = self._drop(hidden, noise)
         if not self.steps:
             return self.head(hidden), last
         assert playing is not None

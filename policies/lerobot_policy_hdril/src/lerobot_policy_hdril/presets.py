@@ -20,6 +20,8 @@ PLAIN: dict[str, Any] = {
     "long_filter_frames": 1,
     "robust": False,
     "hand_noise": 0.0,
+    "planner_dropout": 0.0,
+    "planner_scale": 0.0,
     "replan_every": 0,
 }
 """What the paper's models have: they look once a primitive, or never, and learn from all that they are shown."""
@@ -57,6 +59,8 @@ def _presets() -> dict[str, dict[str, Any]]:
         "long_filter_frames": 24,
         "robust": True,
         "hand_noise": 0.005,
+        "planner_dropout": 0.2,
+        "planner_scale": 0.05,
         "replan_every": 2,
         "decoder": "linear",
     }
