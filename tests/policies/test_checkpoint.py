@@ -225,6 +225,8 @@ def test_older_checkpoint_acts_as_it_did_whatever_the_defaults_are_now(metadata,
         "long_filter_frames",
         "robust",
         "hand_noise",
+        "planner_dropout",
+        "planner_scale",
         "coordinates",
         "replan_every",
     ]

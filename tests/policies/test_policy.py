@@ -355,7 +355,15 @@ def test_a_card_says_when_the_policy_looks(values, looks: str, metadata) -> None
     policy = build(metadata, **values)
     text = str(model_card(policy.config, "user/set", None, None, None, metadata))
     assert looks in text
-    for name in ("termination", "filter_frames", "long_filter_frames", "robust", "hand_noise"):
+    for name in (
+        "termination",
+        "filter_frames",
+        "long_filter_frames",
+        "robust",
+        "hand_noise",
+        "planner_dropout",
+        "planner_scale",
+    ):
         assert f"`{getattr(policy.config, name)}`" in text.partition(f"| `{name}`")[2].partition("\n")[0]
 
 

@@ -61,10 +61,10 @@ class Planner(nn.Module):
 
     def attention(self, normalised: Tensor, raw: Tensor) -> Tensor:
         """Attention weights (B, N, N) of states (B, S)."""
-        return self.graph.attention(self._seen(normalised, raw), raw)
+        return self.graph.attention(self.seen(normalised, raw), raw)
 
-    def _seen(self, normalised: Tensor, raw: Tensor) -> Tensor:
-        """What the graph sees of states (..., S)."""
+    def seen(self, normalised: Tensor, raw: Tensor) -> Tensor:
+        """What the graph sees of states (..., S): what is normalised, and the positions on their second scale."""
         if not len(self.positions):
             return normalised
         return torch.cat([normalised, torch.asinh(raw[..., self.positions] / self.scale)], dim=-1)
@@ -96,8 +96,10 @@ class Planner(nn.Module):
             noise: draws what is left out; without it, nothing is.
         """
         batch, time, _ = normalised.shape
-        seen, flat = self._seen(normalised, raw).flatten(0, 1), raw.flatten(0, 1)
-        nodes = self._drop(self.graph(seen, flat).unflatten(0, (batch, time)), noise)
+        flat = raw.flatten(0, 1)
+        nodes = self._drop(
+            self.graph(self.seen(normalised, raw).flatten(0, 1), flat).unflatten(0, (batch, time)), noise
+        )
         hidden, last = run_gru(self.gru, nodes, memory)
         hidden = self._drop(hidden, noise)
         if not self.steps:
