@@ -694,7 +694,12 @@ def test_noise_disturbs_training_alone(metadata) -> None:
 
 
 @pytest.mark.parametrize(
-    "values", [{"per_primitive": False}, {"latent": "variational", "samples": 2}, {"interaction": "scalar"}]
+    "values",
+    [
+        {"per_primitive": False},
+        {"latent": "variational", "samples": 2},
+        {"interaction": "scalar", "planner_scale": 0.0},
+    ],
 )
 def test_the_defaults_with_another_value_learn_and_act(values: dict[str, Any], metadata, tmp_path: Path) -> None:
     policy = build(metadata, **PRESETS["network_reactive"] | values)
