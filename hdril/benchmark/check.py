@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from math import inf
 
-from hdril.benchmark.matrix import ERRORS, DataSpec, EvaluationSpec, Matrix, PolicySpec, TableSpec, training
+from hdril.benchmark.matrix import BESIDE, DataSpec, EvaluationSpec, Matrix, PolicySpec, TableSpec, training
 from hdril.benchmark.page import slug
 from hdril.benchmark.steps import Record
 from hdril.demonstrations.record import PATIENCE
@@ -163,12 +163,12 @@ def _check_table(matrix: Matrix, table: TableSpec) -> None:
         ("policies", table.policies, matrix.policies),
         ("evaluations", table.evaluations, matrix.evaluations),
         ("against", [table.against] if table.against else [], table.policies),
-        ("errors", table.errors, ERRORS),
+        ("beside", table.beside, BESIDE),
         ("published", list(table.published), table.policies),
     ):
         if missing := [name for name in names if name not in known]:
             raise ValueError(f"table {table.title!r}: {kind} has no {missing[0]!r}; choose from: {', '.join(known)}")
-        if not names and kind not in ("against", "errors", "published"):
+        if not names and kind not in ("against", "beside", "published"):
             raise ValueError(f"table {table.title!r} names no {kind}; choose from: {', '.join(known)}")
         _check_once(table, kind, names)
     _check_once(table, "training_seeds", table.training_seeds)

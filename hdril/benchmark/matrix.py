@@ -8,8 +8,14 @@ from pathlib import Path
 
 from hdril.benchmark.steps import Evaluate, Play, Record, Step, Train
 
-ERRORS = {"position_error_cm": "position, cm", "angle_error_rad": "angle, rad", "dtw_cm": "DTW, cm"}
-"""Errors against the expert by their name in ``results.json``, and what a column is called."""
+BESIDE = {
+    "position_error_cm": "position, cm",
+    "angle_error_rad": "angle, rad",
+    "dtw_cm": "DTW, cm",
+    "pc_expert_choice": "first primitive the expert's, %",
+    "jerk_to_expert": "jerk, times the expert's",
+}
+"""What may stand beside success, by its name in ``results.json``, and what the column is called."""
 
 
 @dataclass
@@ -81,8 +87,9 @@ class TableSpec:
     """Seeds of weights and batches, one training each."""
     against: str = ""
     """The policy that the others are compared with, on the same demonstrations and seeds."""
-    errors: list[str] = field(default_factory=list)
-    """Errors against the expert that are shown beside success: position_error_cm, angle_error_rad, dtw_cm."""
+    beside: list[str] = field(default_factory=list)
+    """What is shown beside success: errors against the expert (position_error_cm, angle_error_rad, dtw_cm), how often the policy
+    begins with the expert's primitive (pc_expert_choice), and its hands' jerk against the expert's (jerk_to_expert)."""
     trajectories: int = 0
     """How many of the demonstrations are drawn, the first ones, with one of them highlighted."""
     episode: int = -1

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from hdril.benchmark.matrix import ERRORS
+from hdril.benchmark.matrix import BESIDE
 from hdril.evaluation.statistics import TrainingSpread
 from hdril.markdown import table as markdown_table
 
@@ -48,6 +48,7 @@ def _seeds(table: Mapping[str, Any]) -> str:
     told = [
         f"`{name}`: `{spec['task']}`, {spec['episodes']} seeds from {spec['seed']} on"
         + (f", `{' '.join(spec['options'])}`" if spec["options"] else "")
+        + f" (the expert succeeds on {spec['episodes'] - table['rows'][0]['cells'][name][0]['n_expert_failures']})"
         for name, spec in table["evaluations"].items()
     ]
     return f"Evaluations: {'; '.join(told)}. Training seeds: {', '.join(map(str, table['training_seeds']))}."
@@ -63,9 +64,9 @@ def _made(made: Mapping[str, Any]) -> str:
 
 
 def _rows(table: Mapping[str, Any]) -> str:
-    names, errors, published = table["evaluations"], table["errors"], table["published"]
+    names, beside, published = table["evaluations"], table["beside"], table["published"]
     heads = ["policy", "trained on", "demonstrations", *_budget(table, None), "steps", "minutes of training"]
-    heads += [head for name in names for head in (name, *(f"{name}: {ERRORS[error]}" for error in errors))]
+    heads += [head for name in names for head in (name, *(f"{name}: {BESIDE[key]}" for key in beside))]
     heads += [table["published_by"]] if published else []
     lines = []
     for row in table["rows"]:
@@ -74,7 +75,7 @@ def _rows(table: Mapping[str, Any]) -> str:
         cells = [
             cell
             for name in names
-            for cell in (_cell(row["cells"][name]), *(_error(row["cells"][name], error) for error in errors))
+            for cell in (_cell(row["cells"][name]), *(_mean(row["cells"][name], key) for key in beside))
         ]
         cells += [published.get(row["policy"], "")] if published else []
         lines.append(
@@ -96,9 +97,10 @@ def _cell(runs: Sequence[Mapping[str, Any]]) -> str:
     return f"{run['n_success']} of {run['n_episodes']}: {run['pc_success']:.1f} ({low:.1f} to {high:.1f})"
 
 
-def _error(runs: Sequence[Mapping[str, Any]], name: str) -> str:
-    """The mean over episodes of each training's error, to three digits, and the range over trainings if there are several."""
-    means = [run[name]["mean"] for run in runs if run[name] is not None]
+def _mean(runs: Sequence[Mapping[str, Any]], name: str) -> str:
+    """What each training has in the mean over episodes, to three digits, and the range over trainings if there are several."""
+    found = [run[name] for run in runs if run[name] is not None]
+    means = [value["mean"] if isinstance(value, Mapping) else value for value in found]
     if not means:
         return ""
     spread = f" ({min(means):.3g} to {max(means):.3g})" if len(means) > 1 else ""

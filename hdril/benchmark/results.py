@@ -28,10 +28,10 @@ from hdril.evaluation.statistics import (
 from hdril.evaluation.stored import read_evaluation
 
 _KEPT = ("n_episodes", "n_success", "pc_success", "pc_success_ci95", "held_out", "position_error_cm", "angle_error_rad",
-         "dtw_cm", "pc_expert_choice", "stages_reached")  # fmt: skip
+         "dtw_cm", "pc_expert_choice", "jerk_to_expert", "n_expert_failures", "stages_reached")  # fmt: skip
 
 
-_SHAPE = 2
+_SHAPE = 3
 """Of a table as data. It counts up when the report needs what older tables do not have: they are not kept then."""
 
 
@@ -105,7 +105,7 @@ def _table(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
         "training_seeds": table.training_seeds,
         "rows": found,
         "against": table.against,
-        "errors": table.errors,
+        "beside": table.beside,
         "published": table.published,
         "published_by": table.published_by,
         "tests": _tests(matrix, table, found),

@@ -45,6 +45,7 @@ def markdown(summary: Mapping[str, Any], outcomes: Sequence[Outcome]) -> str:
     blocks = [
         *_introduction(summary),
         *_errors(summary),
+        *_jerk(summary["jerk_to_expert"]),
         *_order(summary),
         *_comparison(summary["comparison"]),
         *_planner(summary["planner"], get_task(summary["task"]).labels),
@@ -87,6 +88,10 @@ def _errors(summary: Mapping[str, Any]) -> list[str]:
 
 def _spread(value: Mapping[str, float], digits: int) -> str:
     return f"{value['mean']:.{digits}f} ± {value['std']:.{digits}f}"
+
+
+def _jerk(ratio: float | None) -> list[str]:
+    return [] if ratio is None else [f"Where both succeed, the hands' jerk is {ratio:.2f} times the expert's."]
 
 
 def _order(summary: Mapping[str, Any]) -> list[str]:

@@ -25,6 +25,8 @@ key                                   meaning
 ``dtw_cm``                            spread of :attr:`Outcome.dtw_cm`, cm; null likewise
 ``position_error_cm_by_primitive``    spread by name of the expert's primitive, cm; without primitives that were not reached
 ``motion``                            spread of each number of :class:`hdril.evaluation.motion.Motion`, by name
+``jerk_to_expert``                    root mean square of the hands' jerk, over the expert's: the ratio of the means over the
+                                      seeds on which both succeed; null if there are none
 ``stages_reached``                    episodes by the last stage reached: a stage, ``none`` or ``success``
 ``pc_expert_order``                   episodes in which the policy played the primitives that the expert plays in this scene, in
                                       its order, % of those with primitives; null for a policy without
@@ -137,6 +139,7 @@ def summarise(run: Run, outcomes: Sequence[Outcome], comparison: Comparison | No
         "dtw_cm": _spread([outcome.dtw_cm for outcome in compared]),
         "position_error_cm_by_primitive": _by_primitive(compared, get_task(run.task).labels),
         "motion": {name: _spread([outcome.motion[name] for outcome in outcomes]) for name in outcomes[0].motion},
+        "jerk_to_expert": _jerk_to_expert(outcomes),
         "stages_reached": dict(Counter(outcome.stage or "none" for outcome in outcomes)),
         "pc_expert_order": _as_the_expert(outcomes),
         "pc_expert_choice": _as_the_expert(outcomes, first=1),
@@ -167,6 +170,15 @@ def _by_primitive(outcomes: Sequence[Outcome], labels: tuple[str, ...]) -> dict[
     errors = [outcome.position_error_cm_by_primitive for outcome in outcomes]
     spreads = {name: _spread([error[name] for error in errors if name in error]) for name in labels}
     return {name: spread for name, spread in spreads.items() if spread is not None}
+
+
+def _jerk_to_expert(outcomes: Sequence[Outcome]) -> float | None:
+    both = [
+        (outcome.motion["jerk_m_s3"], outcome.expert_jerk_m_s3)
+        for outcome in outcomes
+        if outcome.success and outcome.expert_success and outcome.expert_jerk_m_s3
+    ]
+    return sum(ours for ours, _ in both) / sum(theirs for _, theirs in both) if both else None
 
 
 def _as_the_expert(outcomes: Sequence[Outcome], first: int | None = None) -> float | None:

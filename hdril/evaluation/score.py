@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdril.evaluation.metrics import trajectory_error
-from hdril.evaluation.motion import Motion, motion
+from hdril.evaluation.motion import Motion, jerk, motion
 from hdril.evaluation.reference import Reference, observed_poses
 from hdril.rollout import Ending
 from hdril.simulation.actions import hand_poses
@@ -64,6 +64,8 @@ class Outcome:
     """Whether the expert solves the scene of this seed. If not, the errors above say nothing about the policy."""
     motion: dict[str, float] = field(default_factory=dict)
     """How the hands moved (:class:`hdril.evaluation.motion.Motion`), in the units that the names end with."""
+    expert_jerk_m_s3: float = 0.0
+    """Root mean square of the jerk of the expert's hands in this scene, m/s³; 0 if it was not computed."""
     stages: int = 0
     """How many of the task's stages were reached; success counts as one more."""
     events: tuple[tuple[int, str], ...] = ()
@@ -123,6 +125,7 @@ def score_episode(task: Task, seed: int, trace: Trace, reference: Reference, end
         measures={m.name: round(float(v), 5) for m, v in zip(task.measures, trace.measures[-1], strict=True)},
         expert_success=reference.success,
         motion={name: round(float(value), 5) for name, value in vars(moved).items()},
+        expert_jerk_m_s3=round(jerk(hand_poses(reference.state)[..., :3], task.physics.control_period), 5),
         stages=int(trace.stage[-1]),
         events=tuple((frame, event) for frame, event in enumerate(trace.events) if event),
         noticed=tuple((i, words) for i, told in enumerate(trace.explanations) if told for words in told.events),

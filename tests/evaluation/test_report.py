@@ -101,6 +101,20 @@ def test_there_may_be_no_error_to_tell(tmp_path: Path) -> None:
     assert "mean ± standard deviation" not in text
 
 
+def test_jerk_is_compared_with_the_experts_where_both_succeed() -> None:
+    def moved(seed: int, ours: float, theirs: float, **changes: Any) -> Outcome:
+        return outcome(seed, motion={"jerk_m_s3": ours}, expert_jerk_m_s3=theirs, **changes)
+
+    failures = [moved(2, 100.0, 1.0, success=False), moved(3, 100.0, 1.0, expert_success=False)]
+    outcomes = [moved(0, 3.0, 2.0), moved(1, 1.0, 2.0), *failures]
+    assert summarise(RUN, outcomes)["jerk_to_expert"] == 1.0
+    assert summarise(RUN, outcomes[:1])["jerk_to_expert"] == 1.5
+    assert "the hands' jerk is 1.00 times the expert's" in report(outcomes)
+    for none in (failures, [outcome(0)]):  # the second is of a version that did not compute it
+        assert summarise(RUN, none)["jerk_to_expert"] is None
+        assert "jerk" not in report(none)
+
+
 def test_the_experts_order_is_a_share_of_the_episodes_with_primitives() -> None:
     labels = get_task("table_lift").labels
     outcomes = [

@@ -54,6 +54,18 @@ def test_what_the_policy_noticed_is_told_by_frame() -> None:
     assert in_words(often, 0.1) == "a at 1.0 s, 1.1 s, 1.2 s, 1.3 s, 1.4 s, and 2 times more until 1.6 s"
 
 
+def test_the_experts_jerk_is_that_of_its_hands() -> None:
+    """A hand of the expert stands still but for one jump of 1 cm: third differences of 1, -2 and 1 cm."""
+    assert score(trace()).expert_jerk_m_s3 == pytest.approx(0.0, abs=1e-2)
+    jumps = trace()
+    jumps.state[:, 0::8] = 0.0
+    jumps.state[3:, 0] = 0.01
+    expected = (6 * (0.01 / TASK.physics.control_period**3) ** 2 / (2 * 4)) ** 0.5
+    outcome = score(trace(), reference(jumps))
+    assert outcome.expert_jerk_m_s3 == pytest.approx(expected, rel=1e-4)
+    assert outcome.expert_jerk_m_s3 != outcome.motion["jerk_m_s3"]
+
+
 def test_failures_of_inverse_kinematics_are_counted_by_frame() -> None:
     failing = replace(trace(), ik_failures=("", "left", "left, right", "", "", ""))
     assert score(failing).ik_failures == 2
