@@ -510,7 +510,10 @@ def test_the_report_says_what_was_found(tmp_path: Path) -> None:
         "| `linear` | varied       | 50               | 10      | 1.5 to 1.5            | 2 × 8: 37.5 % (0.0 to 75.0, SD 53.0)"
         in text
     )
-    assert "`varied`: `table_lift:level=varied`, 8 seeds from 600000 on (the expert succeeds on 8). Training seeds: 1, 2." in text
+    assert (
+        "`varied`: `table_lift:level=varied`, 8 seeds from 600000 on (the expert succeeds on 8). Training seeds: 1, 2."
+        in text
+    )
     assert "adjusted by Holm's method for these 4 tests" in text
     assert "not shown" in text
     assert "published" not in text

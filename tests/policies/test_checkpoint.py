@@ -238,6 +238,17 @@ def test_older_checkpoint_acts_as_it_did_whatever_the_defaults_are_now(metadata,
     assert torch.equal(older.select_action(first), saved.select_action(first))
 
 
+def test_checkpoint_from_before_the_second_scale_acts_without_it(metadata, tmp_path: Path) -> None:
+    saved = build(metadata, preset="hdril_reactive", hidden_dim=32, planner_scale=0.0, planner_dropout=0.0).eval()
+    saved.save_pretrained(tmp_path)
+    without(tmp_path, ["planner_scale", "planner_dropout"])
+    older = load(tmp_path)
+    assert older.config.planner_scale == older.config.planner_dropout == 0.0
+    first = observation(metadata, [0])
+    saved.reset()
+    assert torch.equal(older.select_action(first), saved.select_action(first))
+
+
 def test_older_checkpoint_whose_maps_see_something_else_is_refused(metadata, tmp_path: Path) -> None:
     build(metadata, preset="hdril_reactive", hidden_dim=32).save_pretrained(tmp_path)
     without(tmp_path, ["ridge_other"])

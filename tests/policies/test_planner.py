@@ -9,9 +9,10 @@ import pytest
 import torch
 from lerobot_policy_hdril import HDRILConfig, HDRILPolicy
 from lerobot_policy_hdril.planner import Planner
+from lerobot_policy_hdril.presets import PRESETS
 from torch import Tensor
 
-from tests.policies.tools import BATCH, SMALL, build
+from tests.policies.tools import BATCH, FRAMES, SMALL, build
 
 AXES = ("x", "y", "z", "qx", "qy", "qz", "qw")
 NAMES = [f"{node}.{axis}" for node in ("left_ee", "right_ee", "cup") for axis in AXES] + ["cup.size"]
@@ -49,21 +50,30 @@ def test_with_a_scale_the_planner_sees_where_things_are_beside_what_is_normalise
 
 
 def test_the_second_scale_tells_centimetres_at_the_middle_from_far_away() -> None:
-    """A difference of 2 cm about the origin counts ten times as much as 1 m from there, and as much as asinh says."""
-    planner = make(scale=0.05)
-    raw = states() * torch.tensor([0.0 if i in POSITIONS else 1.0 for i in range(len(NAMES))])
-    normalised = torch.zeros_like(raw)
+    """Each position, and nothing else, as asinh(p / scale): 2 cm about the origin count ten times as much as 1 m from there."""
+    planner, raw, normalised = make(scale=0.05), states(), states(1)
+    seen = planner.seen(normalised, raw)
+    torch.testing.assert_close(seen[..., : len(NAMES)], normalised)
+    torch.testing.assert_close(seen[..., len(NAMES) :], (raw[..., POSITIONS] / 0.05).asinh())
+    near, far = ((torch.tensor([at + 0.01, at - 0.01]) / 0.05).asinh().diff().abs() for at in (0.0, 1.0))
+    assert near > 10.0 * far > 0.0
 
-    def embedded(far: float) -> Tensor:
-        return planner.graph(*(each.flatten(0, 1) for each in (planner.seen(normalised, moved(raw, far)), raw)))
 
-    def seen(far: float) -> Tensor:
-        return planner.seen(normalised, moved(raw, far))[0, 0, len(NAMES) :].unique()
+def test_the_second_scale_is_of_the_object_that_is_there() -> None:
+    """Where nobody tells others anything, a cup that moves changes what is known of the cup alone."""
+    planner, normalised = make(scale=0.05), states(1)[:, 0]
+    for name, weight in planner.graph.named_parameters():
+        if "message" in name:
+            torch.nn.init.zeros_(weight)
+    raw = states()[:, 0]
+    elsewhere = raw.clone()
+    elsewhere[:, NAMES.index("cup.x")] += 0.3
 
-    torch.testing.assert_close(seen(0.01), torch.tensor([0.0, 0.01 / 0.05]).asinh())
-    torch.testing.assert_close(seen(-1.0), torch.tensor([-1.0 / 0.05, 0.0]).asinh())
-    near, far = (embedded(at + 0.01) - embedded(at - 0.01) for at in (0.0, 1.0))
-    assert near.norm() > 10.0 * far.norm() > 0.0
+    def known(state: Tensor) -> Tensor:
+        return planner.graph(planner.seen(normalised, state), state).reshape(3, 3, 8)
+
+    differs = (known(elsewhere) - known(raw)).abs().amax((0, 2)) > 1e-4
+    assert differs.tolist() == [False, False, True]
 
 
 def test_attention_stays_between_hands_and_objects() -> None:
@@ -77,32 +87,61 @@ def test_attention_stays_between_hands_and_objects() -> None:
 def test_what_is_left_out_is_the_same_at_all_frames_of_an_episode_and_differs_between_episodes() -> None:
     planner, raw = make(dropout=0.5), states()[:1, :1].expand(3, 5, -1)
 
-    def noise() -> torch.Generator:
+    def generator() -> torch.Generator:
         return torch.Generator().manual_seed(3)
 
-    together, _ = planner(raw, raw, None, *OVER, noise())
+    together, _ = planner(raw, raw, None, *OVER, generator())
     memory = None
     for frame in range(5):
         playing, elapsed = (each[:, frame : frame + 1] for each in OVER)
-        alone, memory = planner(raw[:, :1], raw[:, :1], memory, playing, elapsed, noise())
+        alone, memory = planner(raw[:, :1], raw[:, :1], memory, playing, elapsed, generator())
         torch.testing.assert_close(alone[:, 0], together[:, frame])
     assert (together[0] - together[1]).abs().max() > 1e-4
     whole = planner(raw, raw, None, *OVER)[0]
     torch.testing.assert_close(whole[0], whole[1])
 
 
-def test_the_rest_makes_up_for_what_is_left_out() -> None:
-    """Of many draws, the mean of what a linear head says is what it says without, where the memory sees nothing."""
+def test_a_share_of_the_hidden_states_is_left_out_and_the_rest_makes_up_for_it() -> None:
     planner, count = make(dropout=0.3), 4000
-    planner.head = torch.nn.Sequential(torch.nn.Linear(16 + 3 + 7, 3))
-    torch.nn.init.zeros_(planner.gru.weight_ih_l0)
+    torch.nn.init.zeros_(planner.gru.weight_ih_l0)  # so that what is left out before the memory has no effect
     raw = states()[:1, :1].expand(count, 1, -1)
     told = torch.zeros(count, 1, dtype=torch.long), torch.zeros(count, 1, dtype=torch.long)
-    logits = planner(raw, raw, None, *told, torch.Generator().manual_seed(0))[0][:, 0]
-    without = planner(raw, raw, None, *told)[0][0, 0]
-    deviation = logits.std(0) / count**0.5
-    assert ((logits.mean(0) - without).abs() < 5.0 * deviation).all()
-    assert logits.std(0).min() > 0.001
+    passes_on = torch.nn.Linear(16 + 3 + 7, 16, bias=False)  # what it sees of the memory
+    with torch.no_grad():
+        passes_on.weight.copy_(torch.eye(16, 26))
+    planner.head = torch.nn.Sequential(passes_on)
+    whole = planner(raw, raw, None, *told)[0][0, 0]
+    some = planner(raw, raw, None, *told, torch.Generator().manual_seed(0))[0][:, 0]
+    dropped = some == 0.0
+    assert abs(dropped.float().mean() - 0.3) < 0.01
+    torch.testing.assert_close(torch.where(dropped, whole, some * 0.7), whole.expand(count, -1))
+
+
+def test_some_of_the_embedded_states_are_left_out() -> None:
+    """So the memory differs."""
+    planner, raw = make(dropout=0.3), states()
+    _, whole = planner(raw, raw, None, *OVER)
+    _, some = planner(raw, raw, None, *OVER, torch.Generator().manual_seed(0))
+    assert (whole - some).abs().max() > 1e-3
+
+
+def test_the_planner_leaves_something_out_of_episodes_and_of_single_frames(metadata, monkeypatch) -> None:
+    policy = build(metadata, preset="hdril_reactive", hidden_dim=32)
+    lengths, forward = [], policy.planner.forward
+
+    def watched(normalised, raw, memory=None, playing=None, elapsed=None, generator=None):
+        lengths.append(normalised.shape[1] if generator is not None else None)
+        return forward(normalised, raw, memory, playing, elapsed, generator)
+
+    monkeypatch.setattr(policy.planner, "forward", watched)
+    policy.train().forward({"index": BATCH})
+    policy.eval().forward({"index": BATCH})
+    assert lengths == [FRAMES, 1, None, None]
+
+
+def test_the_papers_models_and_once_a_primitive_have_the_plain_planner() -> None:
+    other = {name for name, values in PRESETS.items() if values["planner_dropout"] or values["planner_scale"]}
+    assert other == {"hdril_reactive", "network_reactive"}
 
 
 def test_dropout_is_for_training_and_decided_by_the_batch(metadata) -> None:
@@ -124,7 +163,8 @@ def test_dropout_is_for_training_and_decided_by_the_batch(metadata) -> None:
     [
         ({"planner_dropout": 1.0}, r"^policy\.planner_dropout must be from 0 to less than 1, got 1\.0$"),
         ({"planner_dropout": -0.1}, r"^policy\.planner_dropout must be from 0 to less than 1"),
-        ({"planner_scale": -0.05}, r"^policy\.planner_scale must not be negative"),
+        ({"planner_scale": -0.05}, r"^policy\.planner_scale must be 0 or a length in m"),
+        ({"planner_scale": float("nan")}, r"^policy\.planner_scale must be 0 or a length in m"),
         (
             {"planner_scale": 0.05, "interaction": "scalar"},
             r"is for policy\.interaction=object; got 0\.05 and scalar$",

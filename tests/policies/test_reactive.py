@@ -675,10 +675,10 @@ def test_a_frame_is_as_uncertain_as_its_errors_and_the_noise_make_it() -> None:
     torch.testing.assert_close(maps.variance[0, 0, 0, 0], second[3:, 3:].trace() + 1e-7)
 
 
-def test_noise_disturbs_training_alone(metadata) -> None:
+@pytest.mark.parametrize("dropout", [0.0, 0.2])
+def test_noise_disturbs_training_alone(dropout: float, metadata) -> None:
     """By what the batch decides: not by how often the generator of PyTorch was asked before."""
-    policy = build(metadata, preset="hdril_reactive", hidden_dim=32)
-    quiet = build(metadata, preset="hdril_reactive", hidden_dim=32)
+    policy, quiet = (build(metadata, preset="hdril_reactive", hidden_dim=32, planner_dropout=dropout) for _ in range(2))
     quiet.hand_noise = None
     quiet.load_state_dict(policy.state_dict())
 

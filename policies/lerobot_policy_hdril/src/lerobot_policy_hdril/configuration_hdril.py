@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args
 
@@ -86,10 +87,11 @@ class HDRILConfig(SingleFrameConfig):
     ``learned``: the planner decides at every frame whether it goes on or one begins, maybe the same again; for
     demonstrations in which primitives are broken off and repeated."""
     planner_dropout: float = 0.2
-    """Share of the planner's inner numbers that training leaves out, so that it learns more from few demonstrations."""
+    """Share of the planner's embedded states and hidden states that training leaves out, so that few demonstrations teach more
+    (:class:`~lerobot_policy_hdril.planner.Planner`)."""
     planner_scale: float = 0.05
-    """The planner sees each position p as asinh(p / planner_scale), too, m; 0: not. For ``interaction=object`` alone; it is 0
-    with others."""
+    """The planner sees the position p of each pose as asinh(p / planner_scale), too, m; 0: not. For ``interaction=object`` alone;
+    it is 0 with others."""
     per_primitive: bool = True
     """One dynamics model per primitive (the paper's Multi), or one for all that is told the primitive. Fused linear maps are one
     for each in any case."""
@@ -240,9 +242,9 @@ class HDRILConfig(SingleFrameConfig):
             )
         if not 0.0 <= self.planner_dropout < 1.0:
             raise ValueError(f"policy.planner_dropout must be from 0 to less than 1, got {self.planner_dropout}")
-        if self.planner_scale < 0 or (self.planner_scale and self.interaction != "object"):
+        if not 0.0 <= self.planner_scale < math.inf or (self.planner_scale and self.interaction != "object"):
             raise ValueError(
-                "policy.planner_scale must not be negative, and is for policy.interaction=object; "
+                "policy.planner_scale must be 0 or a length in m, and is for policy.interaction=object; "
                 f"got {self.planner_scale} and {self.interaction}"
             )
         if self.replan_every < 0:

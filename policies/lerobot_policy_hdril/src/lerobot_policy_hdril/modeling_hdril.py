@@ -234,10 +234,10 @@ class HDRILPolicy(PreTrainedPolicy):
             self._learn_from(self._demonstrations, rows)
         self._check_learned()
         window = self._demonstrations.window(rows, self.config.trained_replan_every, self.ahead)
-        noise = self._noise_of(rows)
-        dynamics_loss, divergence = self.dynamics_loss(window, noise)
+        generator = self._generator_of(rows)
+        dynamics_loss, divergence = self.dynamics_loss(window, generator)
         history = self._demonstrations.history(rows[: self.config.planner_batch_size])
-        planner_loss, accuracy = self.planner_loss(history, window, noise)
+        planner_loss, accuracy = self.planner_loss(history, window, generator)
         loss = dynamics_loss + planner_loss
         if self.config.kl_weight:
             loss = loss + self.config.kl_weight * divergence
@@ -266,7 +266,7 @@ class HDRILPolicy(PreTrainedPolicy):
         if not self.config.primitive_lengths:
             raise RuntimeError("this policy has learned nothing yet: train it with lerobot-train")
 
-    def _noise_of(self, rows: Tensor) -> torch.Generator | None:
+    def _generator_of(self, rows: Tensor) -> torch.Generator | None:
         """What draws the noise of the hands and what the planner leaves out for a batch of these rows (B,); None where nothing
         is drawn.
 
@@ -276,11 +276,11 @@ class HDRILPolicy(PreTrainedPolicy):
             return None
         return torch.Generator(rows.device).manual_seed(zlib.crc32(rows.cpu().numpy().tobytes()))
 
-    def dynamics_loss(self, window: Window, noise: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-        """Mean squared error and mean divergence of the latent, nats; ``noise`` draws that of the hands, if there is any."""
+    def dynamics_loss(self, window: Window, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        """Mean squared error and mean divergence of the latent, nats; ``generator`` draws the noise of the hands."""
         seen = window.seen
-        if self.hand_noise is not None and noise is not None:
-            seen = self.hand_noise(seen, self.state_std, noise)
+        if self.hand_noise is not None and generator is not None:
+            seen = self.hand_noise(seen, self.state_std, generator)
         predicted, divergence = self.predict(seen, window.primitive, window.elapsed)
         difference = predicted - self.target(window)
         if self.config.robust:  # as the linear maps' fit, it is not to follow what is far off
@@ -303,16 +303,18 @@ class HDRILPolicy(PreTrainedPolicy):
         return (elapsed[:, None] + ahead).clamp_max(self.capacity - 1)
 
     def planner_loss(
-        self, history: History, window: Window, noise: torch.Generator | None = None
+        self, history: History, window: Window, generator: torch.Generator | None = None
     ) -> tuple[Tensor, float]:
         """Cross-entropy over all frames of the episodes, and the share of them at which the most probable answer is the
         right one; plus cross-entropy over the frames at which windows start, each seen without what was before it. That
-        is all that :meth:`predict_action_chunk` has where no episode runs. ``noise`` draws what the planner leaves out."""
+        is all that :meth:`predict_action_chunk` has where no episode runs. ``generator`` draws what the planner leaves out."""
         told = (history.playing, history.elapsed) if self.planner.steps else (None, None)
         nothing = torch.zeros_like(window.primitive)[:, None]
         alone_told = (nothing + len(self.config.primitives), nothing) if self.planner.steps else (None, None)
-        logits, _ = self.planner(self.normalise(history.state), history.state, None, *told, noise)
-        alone, _ = self.planner(self.normalise(window.state)[:, None], window.state[:, None], None, *alone_told, noise)
+        logits, _ = self.planner(self.normalise(history.state), history.state, None, *told, generator)
+        alone, _ = self.planner(
+            self.normalise(window.state)[:, None], window.state[:, None], None, *alone_told, generator
+        )
         right, first = history.primitive, window.primitive
         if self.planner.steps:  # 0 is that the primitive goes on
             right, first = torch.where(history.begins, right + 1, 0), first + 1
@@ -323,8 +325,8 @@ class HDRILPolicy(PreTrainedPolicy):
     # ------------------------------------------------------------------ prediction
 
     def normalise(self, state: Tensor) -> Tensor:
-        """What the planner sees: always the world's coordinates. Hands that hold an object are at rest in its frame. Their
-        millimetres of error are many deviations there, and misled a planner that saw them."""
+        """What the planner sees beside positions on a second scale: always the world's coordinates. Hands that hold an object
+        are at rest in its frame. Their millimetres of error are many deviations there, and misled a planner that saw them."""
         return (state - self.state_mean) / self.state_std
 
     def dynamics_input(self, state: Tensor) -> Tensor:

@@ -18,11 +18,13 @@ class Planner(nn.Module):
     With ``steps``, the head is told as well which primitive plays and how many of its frames are over, and decides whether
     that goes on or one begins: the termination of an option (Sutton, Precup and Singh 1999).
 
-    With ``scale``, it sees each position p a second time, as asinh(p / scale). Beside numbers that are normalised by how far an
-    object gets, it is what tells a few centimetres at the robot's middle, where it matters which hand is nearer.
+    With ``scale``, it sees the position p of each pose a second time, as asinh(p / scale), in the frame that the poses are in. A
+    state is normalised by how far an object gets. Beside that, this tells a few centimetres at the robot's middle, where they
+    decide which hand is nearer.
 
-    With ``dropout``, training leaves out that share of the embedded states' numbers and of the hidden states', the same ones at
-    all frames of an episode (Gal and Ghahramani, NeurIPS 2016).
+    With ``dropout``, training leaves out that share of the embedded states' numbers, and of the hidden states' where the head
+    reads them: the same ones at all frames of an episode, as Gal and Ghahramani (NeurIPS 2016) do. They drop what the memory
+    hands on, too; here it is whole.
 
     Args:
         steps: frames of the longest primitive; 0 for a head that sees the states alone.
@@ -69,11 +71,13 @@ class Planner(nn.Module):
             return normalised
         return torch.cat([normalised, torch.asinh(raw[..., self.positions] / self.scale)], dim=-1)
 
-    def _drop(self, values: Tensor, noise: torch.Generator | None) -> Tensor:
+    def _drop(self, values: Tensor, generator: torch.Generator | None) -> Tensor:
         """Values (B, T, D) without some of the D, others in each row."""
-        if noise is None or not self.dropout:
+        if generator is None or not self.dropout:
             return values
-        drawn = torch.rand(len(values), 1, values.shape[-1], generator=noise, dtype=values.dtype, device=values.device)
+        drawn = torch.rand(
+            len(values), 1, values.shape[-1], generator=generator, dtype=values.dtype, device=values.device
+        )
         return values * (drawn >= self.dropout) / (1.0 - self.dropout)
 
     def forward(
@@ -83,7 +87,7 @@ class Planner(nn.Module):
         memory: Tensor | None = None,
         playing: Tensor | None = None,
         elapsed: Tensor | None = None,
-        noise: torch.Generator | None = None,
+        generator: torch.Generator | None = None,
     ) -> tuple[Tensor, Tensor]:
         """States (B, T, S), and the memory (1, B, H) of what was before them, to logits and the new memory.
 
@@ -93,15 +97,15 @@ class Planner(nn.Module):
         Args:
             playing: the primitive at the frame before (B, T), K where there is none.
             elapsed: how many of its frames are over (B, T).
-            noise: draws what is left out; without it, nothing is.
+            generator: draws what is left out; without it, nothing is.
         """
         batch, time, _ = normalised.shape
         flat = raw.flatten(0, 1)
         nodes = self._drop(
-            self.graph(self.seen(normalised, raw).flatten(0, 1), flat).unflatten(0, (batch, time)), noise
+            self.graph(self.seen(normalised, raw).flatten(0, 1), flat).unflatten(0, (batch, time)), generator
         )
         hidden, last = run_gru(self.gru, nodes, memory)
-        hidden = self._drop(hidden, noise)
+        hidden = self._drop(hidden, generator)
         if not self.steps:
             return self.head(hidden), last
         assert playing is not None
