@@ -135,6 +135,10 @@ class HDRILConfig(SingleFrameConfig):
     ridge_other: float = 300.0
     """Penalty on the weights of a fused map for all that :data:`~lerobot_policy_hdril.fusion.RIDGES` are not for, which is most:
     a few demonstrations cannot tell which of some hundred numbers matter."""
+    fusion_shrinkage: float = 0.2
+    """How far the correlations of the frames' errors are shrunk towards 0 where predictions are fused. 1: frames count as
+    independent. Estimated correlations are not exact, and maps that are nearly the same would be played off against each
+    other."""
     min_std: float = 0.01
     """Floor of the deviations that normalise the data, m or dimensionless: numbers that hardly vary must not dominate."""
 
@@ -240,6 +244,8 @@ class HDRILConfig(SingleFrameConfig):
                 "policy.hand_noise must not be negative, and is for policy.coordinates=fused; "
                 f"got {self.hand_noise} and {self.coordinates}"
             )
+        if not 0.0 < self.fusion_shrinkage <= 1.0:
+            raise ValueError(f"policy.fusion_shrinkage must be above 0 and at most 1, got {self.fusion_shrinkage}")
         if not 0.0 <= self.planner_dropout < 1.0:
             raise ValueError(f"policy.planner_dropout must be from 0 to less than 1, got {self.planner_dropout}")
         if not 0.0 <= self.planner_scale < math.inf or (self.planner_scale and self.interaction != "object"):
@@ -274,9 +280,9 @@ class HDRILConfig(SingleFrameConfig):
             for name, value in _BEFORE.items():
                 if name not in self._given:
                     setattr(self, name, value)
-            if self.coordinates == "fused" and "ridge_other" not in self._given:
+            if self.coordinates == "fused" and "fusion_shrinkage" not in self._given:
                 raise ValueError(
-                    "the checkpoint has policy.coordinates=fused of a version in which the maps of every frame saw all alike: "
+                    "the checkpoint has policy.coordinates=fused of a version that fused its maps in another way: "
                     "train it anew, or run it with the version that saved it"
                 )
         if self.primitive_lengths and not self.capacity:

@@ -129,6 +129,7 @@ def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Te
             [(*ridge, config.ridge_other) for ridge in RIDGES],
             config.robust,
             noise_covariance(policy, window, features),
+            config.fusion_shrinkage,
         )
 
 

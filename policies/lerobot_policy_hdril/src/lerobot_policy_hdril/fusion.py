@@ -183,9 +183,12 @@ class FusedMaps(nn.Module):
     """Linear maps from what is seen to the next actions, in every frame, and their fusion.
 
     In frame f a map predicts a hand's pose y_f; the demonstrations' leave-one-out errors of it have the covariance S_f, to which
-    noise of what is seen adds. With the frame's origin t_f and rotation R_f in the world, the position is
+    noise of what is seen adds. Frames err together: what the same object shows in three views differs little, and maps that
+    follow the hand follow it in every frame. Were they taken as independent, many that say the same would outvote the one that
+    knows. So C_fg, the correlation of their errors, is learned as well. With the frame's origin t_f and rotation R_f in the
+    world, the position is that of least variance,
 
-        x = (sum_f P_f)^-1 sum_f P_f (R_f y_f + t_f)        P_f = R_f S_f^-1 R_f^T
+        x = (sum_f P_f)^-1 sum_f P_f (R_f y_f + t_f)        P_f = sum_g T_g^T (C^-1)_gf T_f        T_f = S_f^-1/2 R_f^T
 
     and the orientation is the mean of the frames' quaternions, weighted by the inverse of their variances. What is no pose,
     such as the opening of a hand, has a map of its own, with the penalties of the world's.
@@ -201,12 +204,14 @@ class FusedMaps(nn.Module):
         count, hands, grid, numbers = frames.count, len(frames.hands), (starts, ahead), frames.dim + 1
         self.register_buffer("weight", torch.zeros(count, *grid, 7 * hands, numbers))
         self.register_buffer("plain", torch.zeros(*grid, len(frames.rest), numbers))
-        self.register_buffer("precision", torch.eye(3).expand(count, *grid, hands, 3, 3).clone())
+        self.register_buffer("whitening", torch.eye(3).expand(count, *grid, hands, 3, 3).clone())
+        self.register_buffer("agreement", torch.eye(count).expand(*grid, hands, count, count).clone())
         self.register_buffer("variance", torch.ones(count, *grid, hands))
 
     weight: Tensor
     plain: Tensor
-    precision: Tensor
+    whitening: Tensor  # S_f^-1/2
+    agreement: Tensor  # C^-1
     variance: Tensor
 
     @torch.no_grad()
@@ -221,6 +226,7 @@ class FusedMaps(nn.Module):
         ridges: Sequence[tuple[float, float, float]],
         robust: bool,
         noise: Tensor,
+        shrinkage: float,
     ) -> None:
         """Solve the maps, in float64, see :func:`~lerobot_policy_hdril.dynamics.solve_ridge`.
 
@@ -242,14 +248,17 @@ class FusedMaps(nn.Module):
             robust: leave out windows that are far off a first fit.
             noise: covariance (D, D) of noise on the features that the maps are to bear; 0 for none. The penalty grows as if every
                 window were seen with such noise, and the covariance of a frame's errors by what the noise adds to them.
+            shrinkage: how far correlations of the frames' errors are shrunk towards 0: with 1, frames count as independent.
         """
         for buffer, value in ((self.weight, 0.0), (self.plain, 0.0), (self.variance, 1.0)):
             buffer.fill_(value)
-        self.precision.copy_(torch.eye(3).expand_as(self.precision))
+        self.whitening.copy_(torch.eye(3).expand_as(self.whitening))
+        self.agreement.copy_(torch.eye(frames.count).expand_as(self.agreement))
         if not len(features):
             return
         inputs = torch.cat([features, torch.ones_like(features[:, :1])], dim=-1).double()
         poses, rest = frames.targets(action, seen).double(), action[..., frames.rest].double()
+        rotation = frames.origins(seen).rotation.double()  # (1 + V F, N, 3, 3)
         noise = F.pad(noise.double(), (0, 1, 0, 1))
         reached = start.bincount(minlength=self.plain.shape[0])
         last = int((reached >= SUPPORT * reached[0]).nonzero().max())
@@ -267,17 +276,28 @@ class FusedMaps(nn.Module):
                 if count:
                     here = rows & mask[:, begin]
                     targets = poses[:, here, begin:end], rest[here, begin:end]
-                    self._fit_steps(first, begin, inputs[here], *targets, least, noise)
+                    self._fit_steps(first, begin, inputs[here], *targets, rotation[:, here], least, noise, shrinkage)
                 begin = end
-        for buffer, starts in ((self.weight, 1), (self.plain, 0), (self.precision, 1), (self.variance, 1)):
+        by_frame = (self.weight, self.whitening, self.variance)
+        for buffer, starts in (*((each, 1) for each in by_frame), (self.plain, 0), (self.agreement, 0)):
             by_start = buffer.movedim(starts, 0)
             by_start[last + 1 :] = by_start[last]
 
     def _fit_steps(
-        self, first: int, begin: int, x: Tensor, poses: Tensor, rest: Tensor, least: Tensor, noise: Tensor
+        self,
+        first: int,
+        begin: int,
+        x: Tensor,
+        poses: Tensor,
+        rest: Tensor,
+        rotation: Tensor,
+        least: Tensor,
+        noise: Tensor,
+        shrinkage: float,
     ) -> None:
         """Of the start ``first``, the steps from ``begin`` on: poses (1 + V F, N, m, G, 7) and the rest of the actions
-        (N, m, A - 7 G) from x (N, D + 1), with penalties to choose from for each frame (C, 1 + V F, D + 1)."""
+        (N, m, A - 7 G) from x (N, D + 1), with the frames' rotations (1 + V F, N, 3, 3) and penalties to choose from for each
+        frame (C, 1 + V F, D + 1)."""
         poses = _same_signs(poses)
         count, rows, steps, hands = poses.shape[:4]
         outputs = torch.cat([poses.flatten(3), rest.expand(count, *rest.shape)], dim=-1)  # (1 + V F, N, m, A)
@@ -293,12 +313,16 @@ class FusedMaps(nn.Module):
         near = error <= CLEARLY * error.min(0).values
         best, frames = near.int().argmax(0), torch.arange(count, device=error.device)  # the first of them
         solution, second = solution[best, frames], second[best, frames]
+        far, weight = far[best, frames], weight[best, frames]
         here = slice(begin, begin + steps)
         self.plain[first, here] = solution[0, :, 7 * hands :].to(self.plain)
         self.weight[:, first, here] = solution[:, :, : 7 * hands].to(self.weight)
         position, turn = second[..., :3, :3], second[..., 3:, 3:].diagonal(dim1=-2, dim2=-1).sum(-1)
-        precision = torch.linalg.inv(position + _FLOOR * torch.eye(3).to(second))
-        self.precision[:, first, here] = precision.to(self.precision)
+        whitening = _inverse_root(position + _FLOOR * torch.eye(3).to(second))
+        correlation = _correlation(far[..., :3], weight[..., :3, :], whitening, rotation, noise)
+        agreement = torch.linalg.inv(torch.eye(count).to(second).lerp(correlation, 1.0 - shrinkage))
+        self.whitening[:, first, here] = whitening.to(self.whitening)
+        self.agreement[first, here] = agreement.to(self.agreement)
         self.variance[:, first, here] = (turn + _FLOOR).to(self.variance)
 
     def forward(self, features: Tensor, start: Tensor, frames: ObjectFrames, origins: Origins) -> Tensor:
@@ -308,7 +332,9 @@ class FusedMaps(nn.Module):
         told = (self.weight.index_select(1, start) * inputs).sum(-1).unflatten(-1, (-1, 7))  # (1 + V F, B, M, G, 7)
         poses = origins[:, :, None].place(told)
         means, axes = poses[..., :3], origins.rotation[:, :, None, None]
-        precision = product(product(axes, self.precision.index_select(1, start)), axes.mT)
+        whitened = product(self.whitening.index_select(1, start), axes.mT)  # T_f, (1 + V F, B, M, G, 3, 3)
+        agreement = self.agreement.index_select(0, start).movedim((-2, -1), (0, 1))[..., None, None]
+        precision = product((agreement * whitened[:, None]).sum(0).mT, whitened)
         # Of the differences from the world's mean, which are small: precisions may differ by five orders of magnitude.
         far = apply(precision, means - means[:1]).sum(0)
         position = means[0] + torch.linalg.solve(precision.sum(0), far[..., None])[..., 0]
@@ -319,6 +345,32 @@ class FusedMaps(nn.Module):
         action[..., frames.rest] = rest
         action[..., frames.hands] = torch.cat([position, unit(quaternion)], dim=-1)
         return action
+
+
+def _inverse_root(covariance: Tensor) -> Tensor:
+    """S^-1/2 of covariances S (..., 3, 3)."""
+    variances, axes = torch.linalg.eigh(covariance)
+    return axes * variances.rsqrt()[..., None, :] @ axes.mT
+
+
+def _correlation(far: Tensor, weight: Tensor, whitening: Tensor, rotation: Tensor, noise: Tensor) -> Tensor:
+    """C (m, G, 1 + V F, 1 + V F): how errors of frames correlate, in the world and over all axes, once they are whitened.
+
+    Args:
+        far: leave-one-out errors of positions in each frame (1 + V F, N, m, G, 3).
+        weight: of the maps (1 + V F, m, G, 3, D + 1).
+        whitening: (1 + V F, m, G, 3, 3).
+        rotation: of the frames (1 + V F, N, 3, 3).
+        noise: covariance of what is seen (D + 1, D + 1).
+    """
+    apart = torch.einsum("fnij,fmgjk,fnmgk->fnmgi", rotation, whitening, far)
+    correlation = torch.einsum("fnmgi,hnmgi->mgfh", apart, apart) / far.shape[1]
+    # Noise that all see moves them together, each along its own axes.
+    between = torch.einsum("fnki,hnkj->fhij", rotation, rotation) / far.shape[1]
+    moved = whitening @ weight
+    correlation += torch.einsum("fmgia,ab,hmgjb,fhij->mgfh", moved, noise, moved, between)
+    scale = correlation.diagonal(dim1=-2, dim2=-1).sqrt()
+    return correlation / (scale[..., :, None] * scale[..., None, :])
 
 
 def _same_signs(poses: Tensor) -> Tensor:
