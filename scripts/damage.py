@@ -35,7 +35,7 @@ def damage(checkpoint: Path, output: Path, primitive: str) -> None:
     mine = tuple(f"{part}.{own.index(primitive)}." for part in ("dynamics", "fused"))
     for name, value in weights.items():
         # Predictions without precision could not be fused.
-        if name.startswith(mine) and not name.endswith((".precision", ".variance")):
+        if name.startswith(mine) and not name.endswith((".whitening", ".agreement", ".variance")):
             value.zero_()
     shutil.copytree(checkpoint, output)
     save_file(weights, output / "model.safetensors")

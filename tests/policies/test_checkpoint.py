@@ -230,7 +230,7 @@ def test_older_checkpoint_acts_as_it_did_whatever_the_defaults_are_now(metadata,
         "coordinates",
         "replan_every",
     ]
-    without(tmp_path, [*later, "ridge_other"])
+    without(tmp_path, [*later, "ridge_other", "fusion_shrinkage"])
     older = load(tmp_path)
     assert asdict(older.config) == asdict(HDRILConfig(**asdict(saved.config) | {"pretrained_path": None}))
     first = observation(metadata, [0])
@@ -249,9 +249,9 @@ def test_checkpoint_from_before_the_second_scale_acts_without_it(metadata, tmp_p
     assert torch.equal(older.select_action(first), saved.select_action(first))
 
 
-def test_older_checkpoint_whose_maps_see_something_else_is_refused(metadata, tmp_path: Path) -> None:
+def test_older_checkpoint_whose_maps_were_fused_in_another_way_is_refused(metadata, tmp_path: Path) -> None:
     build(metadata, preset="hdril_reactive", hidden_dim=32).save_pretrained(tmp_path)
-    without(tmp_path, ["ridge_other"])
+    without(tmp_path, ["fusion_shrinkage"])
     with pytest.raises((ValueError, ParsingError)) as raised:
         load(tmp_path)
     told = str(raised.value.__cause__ or raised.value)  # draccus wraps what a config says of itself

@@ -33,6 +33,7 @@ HAND, CUP, SHELF = ([f"{name}.{axis}" for axis in POSE] for name in ("left_ee", 
 STATE = [*HAND, *CUP, *SHELF, "cup.size"]
 ACTION = [*HAND, "left_gripper.pos"]
 LEAST = [(1e-6, 1e-6, 1e-6)]  # a penalty that hardly matters, on all alike
+SHRINKAGE = 0.2
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -264,7 +265,7 @@ def test_each_step_of_a_plan_has_maps_of_its_own_by_where_the_plan_starts() -> N
     noise = torch.zeros(frames.dim, frames.dim)
     mask = torch.ones(400, 2, dtype=torch.bool)
     seen = states[:, None]
-    maps.fit(frames.features(seen), start, frames, seen, actions(states, start), mask, LEAST, False, noise)
+    maps.fit(frames.features(seen), start, frames, seen, actions(states, start), mask, LEAST, False, noise, SHRINKAGE)
     states, start = scenes(20, 3), torch.arange(20) // 3 % 2
     told = maps(frames.features(states[:, None]), start, frames, frames.origins(states[:, None]))
     torch.testing.assert_close(told[..., :3], actions(states, start)[..., :3], atol=2e-3, rtol=0)
@@ -406,7 +407,7 @@ def test_the_maps_are_those_of_the_penalties_that_serve_a_frame_best() -> None:
     features = (features - features.mean(0)) / features.std(0)
     noise = torch.diag(0.3 * torch.rand(frames.dim, generator=draw).double())
     maps = FusedMaps(frames, 2, 2).double()
-    maps.fit(features, start, frames, seen, action, mask, ridges, False, noise)
+    maps.fit(features, start, frames, seen, action, mask, ridges, False, noise, SHRINKAGE)
     x, noise = torch.cat([features, torch.ones(120, 1).double()], dim=-1), F.pad(noise, (0, 1, 0, 1))
     poses, chosen = frames.targets(action, seen)[..., 0, :3], set()
     for first in range(2):
@@ -431,7 +432,9 @@ def test_the_maps_are_those_of_the_penalties_that_serve_a_frame_best() -> None:
                 _, solved, spread = tried[step][best]
                 torch.testing.assert_close(maps.weight[frame, first, step, :3], solved[:3])
                 expected = torch.linalg.inv(spread[:3, :3] + 1e-7 * torch.eye(3))
-                torch.testing.assert_close(maps.precision[frame, first, step, 0], expected)
+                root = maps.whitening[frame, first, step, 0]
+                torch.testing.assert_close(root @ root, expected)
+                torch.testing.assert_close(root, root.T)
                 if frame == 0:
                     torch.testing.assert_close(maps.plain[first, step], solved[3:])
     assert len({best for frame, best in chosen if frame}) > 1
@@ -450,7 +453,7 @@ def test_robust_maps_leave_out_what_is_far_off_at_each_start() -> None:
     places = []
     for given, robust in ((action, False), (wrong, False), (wrong, True)):
         maps = FusedMaps(frames, 2, 1).double()
-        maps.fit(frames.features(seen), start, frames, seen, given, mask, ridges, robust, noise)
+        maps.fit(frames.features(seen), start, frames, seen, given, mask, ridges, robust, noise, SHRINKAGE)
         places.append(maps(frames.features(seen), start, frames, frames.origins(seen))[:, 0, :3])
     assert (places[1] - places[0]).norm(dim=-1).mean() > 0.01
     torch.testing.assert_close(places[2], places[0], atol=2e-3, rtol=0)
@@ -463,7 +466,7 @@ def test_starts_that_few_executions_reach_share_maps_with_the_one_before(late: i
     start = torch.tensor([0] * 100 + [1] * 100 + [2] * late)
     action = torch.cat([at_cup(seen[:, 0]), 0.1 * start[:, None].double()], dim=-1)[:, None]
     mask, noise = torch.ones(len(seen), 1, dtype=torch.bool), torch.zeros(frames.dim, frames.dim)
-    maps.fit(frames.features(seen), start, frames, seen, action, mask, LEAST, False, noise)
+    maps.fit(frames.features(seen), start, frames, seen, action, mask, LEAST, False, noise, SHRINKAGE)
     told = [maps(frames.features(seen), torch.full_like(start, s), frames, frames.origins(seen)) for s in range(4)]
     openings = [float(part[..., 7].mean()) for part in told]
     assert openings[:2] == pytest.approx([0.0, 0.1 if alone else 0.1 + 0.1 * late / (100 + late)], abs=0.01)
@@ -491,7 +494,7 @@ def test_from_few_demonstrations_it_helps_to_know_what_a_frame_sees() -> None:
         inputs = [(part - mean) / std for part in features]
         start, mask = torch.zeros(20, dtype=torch.long), torch.ones(20, 1, dtype=torch.bool)
         quiet = torch.zeros(frames.dim, frames.dim)
-        maps.fit(inputs[0], start, frames, train, action, mask, ridges, False, quiet)
+        maps.fit(inputs[0], start, frames, train, action, mask, ridges, False, quiet, SHRINKAGE)
         given = maps(inputs[1], torch.zeros(200, dtype=torch.long), frames, frames.origins(test))
         return (given[:, 0, :3] - told(test)[:, :3]).norm(dim=-1).mean().item()
 
@@ -509,7 +512,7 @@ def fitted(target: Any, count: int = 300) -> tuple[FusedMaps, ObjectFrames]:
     mask = torch.ones(count, 1, dtype=torch.bool)
     start = torch.zeros(count, dtype=torch.long)
     seen, noise = states[:, None], torch.zeros(frames.dim, frames.dim)
-    maps.fit(frames.features(seen), start, frames, seen, action, mask, LEAST, False, noise)
+    maps.fit(frames.features(seen), start, frames, seen, action, mask, LEAST, False, noise, SHRINKAGE)
     return maps, frames
 
 
@@ -535,39 +538,116 @@ def test_the_frame_in_which_demonstrations_agree_decides(target: Any, best: int)
     dot = (action[:, 3:7] * expected[:, 3:]).sum(-1).abs()
     assert dot.min() > 1.0 - 1e-4
     torch.testing.assert_close(action[:, 7], states[:, -1], atol=1e-3, rtol=0)
-    spread = torch.linalg.inv(maps.precision[:, 0, 0, 0]).diagonal(dim1=-2, dim2=-1).sum(-1)
+    spread = (
+        torch.linalg.inv(maps.whitening[:, 0, 0, 0] @ maps.whitening[:, 0, 0, 0]).diagonal(dim1=-2, dim2=-1).sum(-1)
+    )
     assert int(spread.argmin()) == best
     assert spread.sort().values[1] > 10.0 * spread.min()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_predictions_are_weighted_by_their_precision(dtype: torch.dtype) -> None:
-    """The equation of the docstring, frame by frame; in single precision too, where a frame is certain to a millimetre alone."""
+def test_predictions_are_fused_by_their_joint_covariance(dtype: torch.dtype) -> None:
+    """Generalised least squares; in single precision too, where a frame is certain to a millimetre alone."""
     maps, frames = fitted(at_cup)
-    states, draw = scenes(20, 3), generator(4)
-    spread = torch.tensor([1e-6, 1e-3, 1e-2]).double()[torch.randint(3, (len(maps.precision), 3), generator=draw)]
-    for frame, variances in enumerate(spread):
-        turn = torch.linalg.qr(torch.randn(3, 3, generator=draw).double()).Q
-        maps.precision[frame] = turn @ torch.diag(1.0 / variances) @ turn.T
+    states, draw, count = scenes(20, 3), generator(4), 3
+    spread = torch.tensor([1e-6, 1e-3, 1e-2]).double()[torch.randint(3, (count, 3), generator=draw)]
+    turns = torch.linalg.qr(torch.randn(count, 3, 3, generator=draw).double()).Q
+    maps.whitening[:, 0, 0, 0] = turns @ torch.diag_embed(spread.rsqrt()) @ turns.mT
+    correlation = torch.tensor([[1.0, 0.7, -0.4], [0.7, 1.0, 0.1], [-0.4, 0.1, 1.0]]).double()
+    maps.agreement[0, 0, 0] = torch.linalg.inv(correlation)
     seen = torch.cat([frames.features(states[:, None]), torch.ones(20, 1).double()], dim=-1)
     expected = []
     for row in range(20):
-        total, weighted = torch.zeros(3, 3).double(), torch.zeros(3).double()
+        roots, told = [], []  # of the covariances in the world, and what the frames say
         for frame, pose in enumerate([None, CUP, SHELF]):
             columns = [] if pose is None else [STATE.index(name) for name in pose]
             place = states[row, columns[:3]] if columns else torch.zeros(3).double()
             axes = (
                 torch.from_numpy(rotations(states[row, columns[3:]]).as_matrix()) if columns else torch.eye(3).double()
             )
-            precision = axes @ maps.precision[frame, 0, 0, 0] @ axes.T
-            told = axes @ (maps.weight[frame, 0, 0, :3] @ seen[row]) + place
-            total, weighted = total + precision, weighted + precision @ told
-        expected.append(torch.linalg.solve(total, weighted))
+            roots.append(axes @ torch.linalg.inv(maps.whitening[frame, 0, 0, 0]))
+            told.append(axes @ (maps.weight[frame, 0, 0, :3] @ seen[row]) + place)
+        covariance = (
+            torch.block_diag(*roots) @ torch.kron(correlation, torch.eye(3).double()) @ torch.block_diag(*roots).T
+        )
+        inverse, ones = torch.linalg.inv(covariance), torch.eye(3).double().repeat(count, 1)
+        expected.append(torch.linalg.solve(ones.T @ inverse @ ones, ones.T @ inverse @ torch.cat(told)))
     maps, frames = maps.to(dtype), frames.to(dtype)
     given = states[:, None].to(dtype)
     action = maps(frames.features(given), torch.zeros(20, dtype=torch.long), frames, frames.origins(given))[:, 0]
     tolerance = 1e-4 if dtype == torch.float32 else 1e-9
     torch.testing.assert_close(action[:, :3].double(), torch.stack(expected), atol=tolerance, rtol=0)
+
+
+def test_how_frames_err_together_is_learned() -> None:
+    """Window by window: correlations of whitened errors in the world, leave-one-out errors and what noise adds to them."""
+    frames, draw, count = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION).double(), generator(50), 80
+    states = scenes(count, 2)
+    target = at_cup(states)
+    target[:, :3] += 0.05 * torch.randn(count, 3, generator=draw)
+    action = torch.cat([target, states[:, -1:]], dim=-1)[:, None]
+    start, mask, seen = torch.zeros(count, dtype=torch.long), torch.ones(count, 1, dtype=torch.bool), states[:, None]
+    features = frames.features(seen)
+    covariance = torch.diag(0.01 * torch.rand(frames.dim, generator=draw).double())
+    learned = {}
+    for shrinkage in (0.1, 1.0):
+        learned[shrinkage] = FusedMaps(frames, 1, 1).double()
+        learned[shrinkage].fit(features, start, frames, seen, action, mask, LEAST, False, covariance, shrinkage)
+    maps = learned[0.1]
+    x, noise = torch.cat([features, torch.ones(count, 1).double()], dim=-1), F.pad(covariance, (0, 1, 0, 1))
+    poses, axes = frames.targets(action, seen)[:, :, 0, 0], frames.origins(seen).rotation
+    far, shaken = [], []  # of each frame, whitened and in the world: errors (N, 3), and what moves them (N, 3, D + 1)
+    for frame in range(frames.count):
+        solved, errors = solve_ridge(x, poses[frame], ridge_penalty(x, 1e-6) + count * noise)
+        root = axes[frame] @ maps.whitening[frame, 0, 0, 0]
+        far.append((root @ errors[:, :3, None]).squeeze(-1))
+        shaken.append(root @ solved[:3])
+    second = torch.zeros(3, 3).double()
+    for f in range(3):
+        for g in range(3):
+            by_noise = (shaken[f] @ noise @ shaken[g].mT).diagonal(dim1=-2, dim2=-1).sum(-1)
+            second[f, g] = ((far[f] * far[g]).sum(-1) + by_noise).mean()
+    correlation = second / (second.diagonal()[:, None] * second.diagonal()).sqrt()
+    expected = torch.linalg.inv(0.9 * correlation + 0.1 * torch.eye(3))
+    torch.testing.assert_close(maps.agreement[0, 0, 0], expected, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(learned[1.0].agreement[0, 0, 0], torch.eye(3).double())
+
+
+def test_what_is_seen_three_times_counts_once() -> None:
+    """Where nothing moves, means show what the present state shows: frames that say the same do not outvote another."""
+    draw, count = generator(60), 300
+    states = scenes(count, 2)
+    target = at_cup(states)
+    target[:, :3] = 0.6 * target[:, :3] + 0.4 * states[:, 14:17] + 0.02 * torch.randn(count, 3, generator=draw)
+    action = torch.cat([target, states[:, -1:]], dim=-1)[:, None]
+    start, mask, test = torch.zeros(count, dtype=torch.long), torch.ones(count, 1, dtype=torch.bool), scenes(50, 3)
+
+    def predictions(views: int, shrinkage: float) -> Tensor:
+        frames = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION, views).double()
+        maps, seen, given = FusedMaps(frames, 1, 1).double(), states[:, None].expand(-1, views, -1), test[:, None]
+        given = given.expand(-1, views, -1)
+        none = torch.zeros(frames.dim, frames.dim)
+        ridges = [(1.0, 30.0, 3000.0)]
+        maps.fit(frames.features(seen), start, frames, seen, action, mask, ridges, False, none, shrinkage)
+        return maps(frames.features(given), torch.zeros(50, dtype=torch.long), frames, frames.origins(given))[:, 0, :3]
+
+    together, apart = (
+        (predictions(3, shrinkage) - predictions(1, shrinkage)).norm(dim=-1).mean() for shrinkage in (1e-3, 1.0)
+    )
+    assert together < 0.2 * apart
+
+
+@pytest.mark.parametrize("shrinkage", [0.0, 1.1, float("nan")])
+def test_correlations_are_shrunk_by_a_share(shrinkage: float) -> None:
+    with pytest.raises(ValueError, match=r"^policy\.fusion_shrinkage must be above 0 and at most 1, got "):
+        HDRILConfig(device="cpu", push_to_hub=False, fusion_shrinkage=shrinkage)
+
+
+def test_the_fit_takes_the_shrinkage_of_the_option(metadata) -> None:
+    alone, together = (build(metadata, preset="hdril_reactive", hidden_dim=32, fusion_shrinkage=s) for s in (1.0, 0.2))
+    identity = torch.eye(alone.fused[0].agreement.shape[-1])
+    assert (alone.fused[0].agreement - identity).abs().max() < 1e-5
+    assert (together.fused[0].agreement - identity).abs().max() > 1e-2
 
 
 def test_a_fused_policy_says_what_it_needs(metadata) -> None:
@@ -652,7 +732,7 @@ def following(noise: float) -> tuple[FusedMaps, Tensor, Tensor, Tensor]:
     start, mask = torch.zeros(400, dtype=torch.long), torch.ones(400, 1, dtype=torch.bool)
     seen, covariance = frames.features(states[:, None]), torch.diag(deviations.square())
     seen[:, 23:] = 0.0  # the world's coordinates alone, so that one number is one way to follow
-    maps.fit(seen, start, frames, states[:, None], action, mask, LEAST, False, covariance)
+    maps.fit(seen, start, frames, states[:, None], action, mask, LEAST, False, covariance, SHRINKAGE)
     return maps, seen, target, covariance
 
 
@@ -671,7 +751,8 @@ def test_a_frame_is_as_uncertain_as_its_errors_and_the_noise_make_it() -> None:
     weight, errors = solve_ridge(x, target, ridge_penalty(x, 1e-6) + 400 * noise)
     second = errors.T @ errors / 400 + weight @ noise @ weight.T
     torch.testing.assert_close(maps.weight[0, 0, 0], weight)
-    torch.testing.assert_close(torch.linalg.inv(maps.precision[0, 0, 0, 0]), second[:3, :3] + 1e-7 * torch.eye(3))
+    root = maps.whitening[0, 0, 0, 0]
+    torch.testing.assert_close(torch.linalg.inv(root @ root), second[:3, :3] + 1e-7 * torch.eye(3))
     torch.testing.assert_close(maps.variance[0, 0, 0, 0], second[3:, 3:].trace() + 1e-7)
 
 
