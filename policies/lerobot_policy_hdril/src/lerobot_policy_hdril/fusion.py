@@ -1,4 +1,4 @@
-"""Predictions in the frame of the world and of every object, fused by their precision.
+"""Predictions in the frame of the world and of every object, fused by their joint precision.
 
 A movement is often simple in the frame of the object that it is about: a grasp ends at the same place of the object, wherever
 that is. Which object counts, and when, is learned: the frame in which demonstrations agree predicts with little variance, and
@@ -188,9 +188,10 @@ class FusedMaps(nn.Module):
     knows. So C_fg, the correlation of their errors, is learned as well. With the frame's origin t_f and rotation R_f in the
     world, the position is that of least variance,
 
-        x = (sum_f P_f)^-1 sum_f P_f (R_f y_f + t_f)        P_f = sum_g T_g^T (C^-1)_gf T_f        T_f = S_f^-1/2 R_f^T
+        x = (sum_f P_f)^-1 sum_f P_f (R_f y_f + t_f)        P_f = sum_g T_g (C^-1)_gf T_f        T_f = R_f S_f^-1/2 R_f^T
 
-    and the orientation is the mean of the frames' quaternions, weighted by the inverse of their variances. What is no pose,
+    One C serves all three axes. A frame that errs more than another does, and with it, can have a weight below 0. The orientation
+    is the mean of the frames' quaternions, weighted by the inverse of their variances, as if they erred apart. What is no pose,
     such as the opening of a hand, has a map of its own, with the penalties of the world's.
 
     Args:
@@ -332,9 +333,11 @@ class FusedMaps(nn.Module):
         told = (self.weight.index_select(1, start) * inputs).sum(-1).unflatten(-1, (-1, 7))  # (1 + V F, B, M, G, 7)
         poses = origins[:, :, None].place(told)
         means, axes = poses[..., :3], origins.rotation[:, :, None, None]
-        whitened = product(self.whitening.index_select(1, start), axes.mT)  # T_f, (1 + V F, B, M, G, 3, 3)
+        whitened = product(
+            axes, product(self.whitening.index_select(1, start), axes.mT)
+        )  # T_f, (1 + V F, B, M, G, 3, 3)
         agreement = self.agreement.index_select(0, start).movedim((-2, -1), (0, 1))[..., None, None]
-        precision = product((agreement * whitened[:, None]).sum(0).mT, whitened)
+        precision = product((agreement * whitened[:, None]).sum(0), whitened)
         # Of the differences from the world's mean, which are small: precisions may differ by five orders of magnitude.
         far = apply(precision, means - means[:1]).sum(0)
         position = means[0] + torch.linalg.solve(precision.sum(0), far[..., None])[..., 0]
@@ -356,6 +359,8 @@ def _inverse_root(covariance: Tensor) -> Tensor:
 def _correlation(far: Tensor, weight: Tensor, whitening: Tensor, rotation: Tensor, noise: Tensor) -> Tensor:
     """C (m, G, 1 + V F, 1 + V F): how errors of frames correlate, in the world and over all axes, once they are whitened.
 
+    The least variance of a frame counts as an error that no other has.
+
     Args:
         far: leave-one-out errors of positions in each frame (1 + V F, N, m, G, 3).
         weight: of the maps (1 + V F, m, G, 3, D + 1).
@@ -365,12 +370,13 @@ def _correlation(far: Tensor, weight: Tensor, whitening: Tensor, rotation: Tenso
     """
     apart = torch.einsum("fnij,fmgjk,fnmgk->fnmgi", rotation, whitening, far)
     correlation = torch.einsum("fnmgi,hnmgi->mgfh", apart, apart) / far.shape[1]
-    # Noise that all see moves them together, each along its own axes.
+    # Noise that all see moves them together, each along its own axes. It is a mean over the windows, and so are the turns between
+    # frames. Where frames turn much against each other, this says less than the truth.
     between = torch.einsum("fnki,hnkj->fhij", rotation, rotation) / far.shape[1]
     moved = whitening @ weight
     correlation += torch.einsum("fmgia,ab,hmgjb,fhij->mgfh", moved, noise, moved, between)
-    scale = correlation.diagonal(dim1=-2, dim2=-1).sqrt()
-    return correlation / (scale[..., :, None] * scale[..., None, :])
+    same = torch.eye(len(far), dtype=torch.bool, device=far.device)
+    return (correlation / far.shape[-1]).masked_fill(same, 1.0)
 
 
 def _same_signs(poses: Tensor) -> Tensor:
