@@ -17,7 +17,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.policies.factory import make_policy
 from lerobot_policy_hdril import HDRILConfig, HDRILPolicy, fitting
 from lerobot_policy_hdril.overrides import CHANGEABLE, check_overrides
-from lerobot_policy_hdril.presets import PRESETS
+from lerobot_policy_hdril.presets import PLAIN, PRESETS
 from safetensors.torch import load_file, save_file
 from torch.utils.data import DataLoader
 
@@ -219,18 +219,7 @@ def test_older_checkpoint_acts_as_it_did_whatever_the_defaults_are_now(metadata,
     """Its config lacks the options that came later."""
     saved = build(metadata, preset="hdril", hidden_dim=32).eval()
     saved.save_pretrained(tmp_path)
-    later = [
-        "termination",
-        "filter_frames",
-        "long_filter_frames",
-        "robust",
-        "hand_noise",
-        "planner_dropout",
-        "planner_scale",
-        "coordinates",
-        "replan_every",
-    ]
-    without(tmp_path, [*later, "ridge_other", "fusion_shrinkage"])
+    without(tmp_path, [*PLAIN, "coordinates", "ridge_other", "fusion_shrinkage"])
     older = load(tmp_path)
     assert asdict(older.config) == asdict(HDRILConfig(**asdict(saved.config) | {"pretrained_path": None}))
     first = observation(metadata, [0])

@@ -22,7 +22,7 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from lerobot_policy_hdril import HDRILConfig, HDRILPolicy, companions
 from lerobot_policy_hdril.card import model_card
 from lerobot_policy_hdril.demonstrations import Demonstrations
-from lerobot_policy_hdril.presets import PRESETS
+from lerobot_policy_hdril.presets import PLAIN, PRESETS
 
 from tests.policies.tools import BATCH, FRAMES, SMALL, VARIANTS, Training, build, demonstrations, observation, read
 
@@ -355,15 +355,7 @@ def test_a_card_says_when_the_policy_looks(values, looks: str, metadata) -> None
     policy = build(metadata, **values)
     text = str(model_card(policy.config, "user/set", None, None, None, metadata))
     assert looks in text
-    for name in (
-        "termination",
-        "filter_frames",
-        "long_filter_frames",
-        "robust",
-        "hand_noise",
-        "planner_dropout",
-        "planner_scale",
-    ):
+    for name in PLAIN:
         assert f"`{getattr(policy.config, name)}`" in text.partition(f"| `{name}`")[2].partition("\n")[0]
 
 
