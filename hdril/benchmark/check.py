@@ -9,6 +9,7 @@ from math import inf
 from hdril.benchmark.matrix import BESIDE, DataSpec, EvaluationSpec, Matrix, PolicySpec, TableSpec, training
 from hdril.benchmark.page import slug
 from hdril.benchmark.steps import Record
+from hdril.demonstrations.perturb import check_perturbation
 from hdril.demonstrations.record import PATIENCE
 from hdril.evaluation.identity import identify_trials
 from hdril.files import MAX_SEED
@@ -43,8 +44,10 @@ def check(matrix: Matrix) -> None:
     for name, data in matrix.data.items():
         get_task(data.task)
         _check_seeds(f"data {name}", data.seed, data.episodes)
-        if data.perturb < 0.0:
-            raise ValueError(f"data {name}: perturb must not be negative, got {data.perturb}")
+        try:
+            check_perturbation(data.perturb, data.stray)
+        except ValueError as error:
+            raise ValueError(f"data {name}: {error}") from None
     for name, policy in matrix.policies.items():
         if not policy.config.exists():
             raise FileNotFoundError(f"policy {name}: there is no config file {policy.config}")

@@ -30,6 +30,8 @@ class DataSpec:
     """First seed."""
     perturb: float = 0.0
     """Noise that the robot gets and the record does not, m, as hdril-record has it."""
+    stray: float = 0.0
+    """How far hands stray now and then, m, as hdril-record has it."""
 
 
 @dataclass
@@ -142,7 +144,7 @@ def rows(matrix: Matrix, table: TableSpec) -> Iterator[Row]:
     """The rows of a table, with the steps that fill them."""
     for name in table.data:
         spec = matrix.data[name]
-        record = Record(spec.task, spec.episodes, spec.seed, spec.perturb)
+        record = Record(spec.task, spec.episodes, spec.seed, spec.perturb, spec.stray)
         for count in table.demonstrations or [spec.episodes]:
             for policy in table.policies:
                 for minutes in matrix.policies[policy].minutes or [0.0]:

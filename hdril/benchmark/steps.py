@@ -79,6 +79,7 @@ class Record(Step):
     episodes: int
     first_seed: int = 0
     perturb: float = 0.0
+    stray: float = 0.0
 
     kind = "record"
 
@@ -90,7 +91,8 @@ class Record(Step):
         return dict(vars(self)) | {"software": recording_software(base_name(self.task))}
 
     def command(self, output: Path, inputs: Folders) -> list[str]:
-        options = [f"--perturb={self.perturb:g}"] if self.perturb else []
+        noise = {"perturb": self.perturb, "stray": self.stray}
+        options = [f"--{name}={value:g}" for name, value in noise.items() if value]
         return ["hdril-record", f"--task={self.task}", f"--num_episodes={self.episodes}", f"--seed={self.first_seed}",
                 *options, "--workers=1", f"--root={output}"]  # fmt: skip
 

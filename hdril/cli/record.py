@@ -42,6 +42,9 @@ class RecordConfig(PlayOptions):
     (push=0.3,open_hand=0.2), any_event=0.5 for one of all. The expert mends what it can, and what it cannot is dropped."""
     perturb: float = 0.0
     """Standard deviation, m, of noise that the robot gets at every frame and the recorded action does not."""
+    stray: float = 0.0
+    """Standard deviation, m, of places beside its way to which a hand is sent now and then, for about a second; the recorded
+    action is what was meant. Grasps miss by it, and the expert shows how that is mended."""
     num_episodes: int = 100
     """Successful episodes to record."""
     seed: int = 0
@@ -76,7 +79,7 @@ def record_command(config: RecordConfig) -> None:
     if NUMBERS not in check_forms(config.labels):
         raise ValueError(f"labels must have {NUMBERS}; it may have {WORDS} beside it, got {config.labels!r}")
     check_shards(config, config.push)
-    recipe = Recipe(with_events(config.task, config.events), config.noise, perturb=config.perturb)
+    recipe = Recipe(with_events(config.task, config.events), config.noise, perturb=config.perturb, stray=config.stray)
     root = config.root or default_root(recipe.task, config.repo_id)
     if config.push and root.exists():
         _check_same(root, recipe, config)

@@ -28,7 +28,8 @@ class Recipe:
     """All that makes a demonstration, beside its seed: with both, any episode can be made again, bit for bit.
 
     ``physics`` is the task's own unless given. ``perturb`` is the standard deviation, m, of noise that the robot's commands get
-    and the recorded actions do not (:class:`~hdril.demonstrations.perturb.PerturbedActor`).
+    and the recorded actions do not, and ``stray`` that of places beside its way to which a hand is sent now and then
+    (:class:`~hdril.demonstrations.perturb.PerturbedActor`).
 
     Raises:
         ValueError: unknown task or robot, or a perturbation that is out of range.
@@ -39,14 +40,20 @@ class Recipe:
     physics: Physics | None = None
     robot: str = "baxter"
     perturb: float = 0.0
+    stray: float = 0.0
 
     def __post_init__(self) -> None:
         task = get_task(self.task)
         if self.robot not in ROBOTS:
             raise ValueError(f"unknown robot {self.robot!r}; choose from: {', '.join(ROBOTS)}")
-        check_perturbation(self.perturb)
+        check_perturbation(self.perturb, self.stray)
         if self.physics is None:
             object.__setattr__(self, "physics", task.physics)
+
+    @property
+    def perturbed(self) -> bool:
+        """Whether the robot is told something else than what is recorded."""
+        return self.perturb > 0.0 or self.stray > 0.0
 
     def as_dict(self, hdril_version: str) -> dict[str, Any]:
         """The recipe and the version of hdril that plays it, for JSON."""
@@ -59,7 +66,7 @@ class Recipe:
     def make_expert(self) -> Actor:
         """The expert that demonstrates."""
         expert = ScriptedExpert(get_task(self.task), self.noise)
-        return PerturbedActor(expert, self.perturb) if self.perturb else expert
+        return PerturbedActor(expert, self.perturb, self.stray) if self.perturbed else expert
 
 
 @dataclass(frozen=True)
@@ -127,7 +134,7 @@ def _provenance(values: object) -> Provenance:
     if isinstance(values, dict):
         values = {"digest": ""} | values
     told = _named(values, "", ("recipe", "seeds", "dropped", "digest"))
-    since = {"perturb": 0.0}  # fields that datasets of earlier versions do not have
+    since = {"perturb": 0.0, "stray": 0.0}  # fields that datasets of earlier versions do not have
     recipe = since | told["recipe"] if isinstance(told["recipe"], dict) else told["recipe"]
     recipe = _named(recipe, "recipe", (*(entry.name for entry in fields(Recipe)), "hdril_version"))
     seeds, dropped = told["seeds"], told["dropped"]
@@ -137,13 +144,15 @@ def _provenance(values: object) -> Provenance:
         raise ValueError("dropped must be an object of texts by seed")
     for name in ("task", "robot", "hdril_version"):
         _check_type(recipe[name], "", f"recipe.{name}")
-    _check_type(recipe["perturb"], 0.0, "recipe.perturb")
+    for name in ("perturb", "stray"):
+        _check_type(recipe[name], 0.0, f"recipe.{name}")
     made = Recipe(
         task=recipe["task"],
         noise=_settings(Noise, recipe["noise"], "recipe.noise"),
         physics=_settings(Physics, recipe["physics"], "recipe.physics"),
         robot=recipe["robot"],
         perturb=recipe["perturb"],
+        stray=recipe["stray"],
     )
     _check_type(told["digest"], "", "digest")
     why = {int(seed): reason for seed, reason in dropped.items()}

@@ -40,6 +40,7 @@ def dataset_card(repo_id: str, root: Path) -> str:
     task, recipe = get_task(provenance.recipe.task), provenance.recipe
     noise = " ".join(f"--noise.{name}={value}" for name, value in asdict(recipe.noise).items())
     noise += f" --perturb={recipe.perturb:g}" if recipe.perturb else ""
+    noise += f" --stray={recipe.stray:g}" if recipe.stray else ""
     dropped = len(provenance.dropped)
     description = f"""Scripted demonstrations of the task `{recipe.task}` ({task.description}) with two arms of a simulated
 {recipe.robot.capitalize()}: {metadata.total_episodes} episodes, {metadata.total_frames} frames at {metadata.fps} Hz, each

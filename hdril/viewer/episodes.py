@@ -100,7 +100,7 @@ def show_dataset(root: Path, episode: int, path: Path) -> tuple[Path, str]:
 def _own(provenance: Provenance, episode: int, stored: StoredEpisode, path: Path) -> tuple[Path, str]:
     seed, recipe = provenance.seeds[episode], provenance.recipe
     # A robot that was disturbed was not told the actions that are recorded: the expert plays again, with the same noise.
-    actor = recipe.make_expert() if recipe.perturb else ReplayActor(stored.action)
+    actor = recipe.make_expert() if recipe.perturbed else ReplayActor(stored.action)
     env = recipe.make_env()
     with closing(env):
         reference = ReferenceCache(recipe.task).get(seed)

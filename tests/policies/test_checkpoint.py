@@ -219,7 +219,7 @@ def test_older_checkpoint_acts_as_it_did_whatever_the_defaults_are_now(metadata,
     """Its config lacks the options that came later."""
     saved = build(metadata, preset="hdril", hidden_dim=32).eval()
     saved.save_pretrained(tmp_path)
-    without(tmp_path, [*PLAIN, "coordinates", "ridge_other", "fusion_shrinkage"])
+    without(tmp_path, [*PLAIN, "coordinates", "ridge_other", "fusion_shrinkage", "fourier_features"])
     older = load(tmp_path)
     assert asdict(older.config) == asdict(HDRILConfig(**asdict(saved.config) | {"pretrained_path": None}))
     first = observation(metadata, [0])

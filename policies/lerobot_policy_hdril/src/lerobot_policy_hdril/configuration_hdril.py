@@ -28,14 +28,14 @@ Termination = Literal["length", "learned"]
 
 
 _FREE = (
-    "hidden_dim", "termination", "filter_frames", "long_filter_frames", "robust", "hand_noise", "planner_dropout",
-    "planner_scale", "replan_every",
+    "hidden_dim", "termination", "filter_frames", "long_filter_frames", "robust", "hand_noise", "planner_balance",
+    "planner_dropout", "planner_scale", "replan_every",
 )  # fmt: skip
 """Options that may differ from the preset's value."""
 _FILTERS = ("filter_frames", "long_filter_frames")
 """Options that give the lengths of the means, frames."""
 _RIDGES = ("ridge", "ridge_other")
-_BEFORE = PLAIN | {"coordinates": "absolute"}
+_BEFORE = PLAIN | {"coordinates": "absolute", "fourier_features": 0}
 """Values of options whose default was another one, or which were not there, when a checkpoint without them was saved."""
 
 
@@ -60,8 +60,8 @@ class HDRILConfig(SingleFrameConfig):
     preset: str = ""
     """Name of a model in :data:`~lerobot_policy_hdril.presets.PRESETS`, which then decides the values of this group, and
     ``hidden_dim``. ``hidden_dim``, ``termination``, ``filter_frames``, ``long_filter_frames``, ``robust``, ``hand_noise``,
-    ``planner_dropout``, ``planner_scale`` and ``replan_every`` may be given nevertheless, where the model has a use for them.
-    Empty to set them one by one. Once the policy has learned it is a name only."""
+    ``planner_balance``, ``planner_dropout``, ``planner_scale`` and ``replan_every`` may be given nevertheless, where the model
+    has a use for them. Empty to set them one by one. Once the policy has learned it is a name only."""
     interaction: Interaction = "object"
     """Graph attention: ``none``; ``scalar``, the paper's node per number of the state; ``object``, a node per object."""
     skip: bool = True
@@ -86,6 +86,10 @@ class HDRILConfig(SingleFrameConfig):
     """When a primitive is over. ``length``: after its shortest recorded length, as soon as the planner prefers another.
     ``learned``: the planner decides at every frame whether it goes on or one begins, maybe the same again; for
     demonstrations in which primitives are broken off and repeated."""
+    planner_balance: float = 0.5
+    """How much more the beginnings that are rare count when the planner learns, 0 (not) to 1 (as much as all frequent ones
+    together): few demonstrations show how something is mended (:func:`~lerobot_policy_hdril.planner.begin_weights`). For
+    ``termination=learned`` alone; it is 0 with others."""
     planner_dropout: float = 0.2
     """Share of the planner's embedded states and hidden states that training leaves out, so that few demonstrations teach more
     (:class:`~lerobot_policy_hdril.planner.Planner`)."""
@@ -139,6 +143,10 @@ class HDRILConfig(SingleFrameConfig):
     """How far the correlations of the frames' errors are shrunk towards 0 where predictions are fused. 1: frames count as
     independent. Estimated correlations are not exact, and maps that are nearly the same would be played off against each
     other."""
+    fourier_features: int = 32
+    """How many random Fourier features of each object's pose a fused map in its frame sees, so that it can bend with where that
+    stands (:class:`~lerobot_policy_hdril.fourier.FourierFeatures`); 0: the maps are linear. For ``coordinates=fused`` alone; it
+    is 0 with others."""
     min_std: float = 0.01
     """Floor of the deviations that normalise the data, m or dimensionless: numbers that hardly vary must not dominate."""
 
@@ -195,8 +203,13 @@ class HDRILConfig(SingleFrameConfig):
         self._complete_older_checkpoint()
         if self.preset and not self.primitives:
             self._apply_preset()
-        if self.coordinates != "fused" and "hand_noise" not in self._given:
-            self.hand_noise = 0.0
+        if self.coordinates != "fused":
+            if "hand_noise" not in self._given:
+                self.hand_noise = 0.0
+            if "fourier_features" not in self._given:
+                self.fourier_features = 0
+        if self.termination != "learned" and "planner_balance" not in self._given:
+            self.planner_balance = 0.0
         if self.interaction != "object" and "planner_scale" not in self._given:
             self.planner_scale = 0.0
         if self.coordinates != "fused" and "decoder" not in self._given and not self.preset:
@@ -246,6 +259,16 @@ class HDRILConfig(SingleFrameConfig):
             )
         if not 0.0 < self.fusion_shrinkage <= 1.0:
             raise ValueError(f"policy.fusion_shrinkage must be above 0 and at most 1, got {self.fusion_shrinkage}")
+        if self.fourier_features < 0 or (self.fourier_features and self.coordinates != "fused"):
+            raise ValueError(
+                "policy.fourier_features must be 0 (none) or more, and is for policy.coordinates=fused; "
+                f"got {self.fourier_features} and {self.coordinates}"
+            )
+        if not 0.0 <= self.planner_balance <= 1.0 or (self.planner_balance and self.termination != "learned"):
+            raise ValueError(
+                "policy.planner_balance must be from 0 to 1, and is for policy.termination=learned; "
+                f"got {self.planner_balance} and {self.termination}"
+            )
         if not 0.0 <= self.planner_dropout < 1.0:
             raise ValueError(f"policy.planner_dropout must be from 0 to less than 1, got {self.planner_dropout}")
         if not 0.0 <= self.planner_scale < math.inf or (self.planner_scale and self.interaction != "object"):

@@ -250,6 +250,14 @@ class Demonstrations:
         runs = [lengths[labels == k] for k in range(len(self.primitives))]
         return [[int(run.min()), int(run.max())] if len(run) else [0, 0] for run in runs]
 
+    def beginnings(self, episodes: Tensor) -> Tensor:
+        """How often each primitive begins after each, and first of all (K + 1, K), in these episodes."""
+        first = self._segment_bounds[episodes[self.episode[self._segment_bounds[:, 0]]], 0]
+        fresh = first == self._episode_bounds[self.episode[first], 0]
+        count = len(self.primitives)
+        before = torch.where(fresh, count, self.label[(first - 1).clamp_min(0)])
+        return (before * count + self.label[first]).bincount(minlength=(count + 1) * count).unflatten(0, (-1, count))
+
     def replan_rows(self, stride: int, episodes: Tensor) -> Tensor:
         """Rows of these episodes at which a running policy makes a plan: every ``stride`` frames of a primitive, or at its
         start alone if ``stride`` is 0."""

@@ -112,9 +112,12 @@ def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Te
     frames, maps, config = policy.frames, policy.fused, policy.config
     assert frames is not None
     assert maps is not None
-    single = frames.single(demonstrations.state[episodes[demonstrations.episode]].double())
+    states = demonstrations.state[episodes[demonstrations.episode]].double()
+    single = frames.single(states)
     policy.feature_mean.copy_(single.mean(0)[frames.alike])
     policy.feature_std.copy_(single.std(0, correction=0).clamp_min(config.min_std)[frames.alike])
+    if frames.fourier is not None:
+        frames.fourier.fit(states, config.min_std)
     rows = demonstrations.replan_rows(policy.ahead, episodes)
     for k in range(len(maps)):
         window = _window(demonstrations, rows[demonstrations.label[rows] == k], policy.ahead, policy.ahead)
@@ -134,7 +137,7 @@ def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Te
 
 
 def noise_covariance(policy: HDRILPolicy, window: Window, features: Tensor) -> Tensor:
-    """Second moments (D, D) of how far features (N, D) of windows are moved by noise of the hands."""
+    """Second moments (W, W) of how far features (N, W) of windows are moved by noise of the hands."""
     total = features.new_zeros(features.shape[1], features.shape[1])
     if policy.hand_noise is None or not len(features):
         return total

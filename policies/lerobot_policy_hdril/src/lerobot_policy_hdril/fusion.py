@@ -21,6 +21,7 @@ from torch.nn import functional as F
 
 from lerobot_policy_hdril.coordinates import Origins, apply, positive, product, unit
 from lerobot_policy_hdril.dynamics import FREE, solve_ridge, usual_windows
+from lerobot_policy_hdril.fourier import FourierFeatures
 from lerobot_policy_hdril.graph import node_of, pose_groups
 
 _FLOOR = 1e-7
@@ -31,6 +32,10 @@ leave-one-out error is not clearly above the least: a light one may follow noise
 that it goes to."""
 CLEARLY = 2.0
 """Times that a mean squared leave-one-out error must be above the least one for a penalty to be too heavy."""
+BENDS = 1.03
+"""A map bends with where its frame's object stands (:class:`~lerobot_policy_hdril.fourier.FourierFeatures`) unless its mean
+squared leave-one-out error is then more than so many times as large, as it is where there are few demonstrations. To ask for a
+smaller one would be too much: where a hand goes in the next frames hangs on where it is, and little on where it will end."""
 MOVED = 0.03
 """Distance from its longest mean, m, at which an object counts as just moved, in the median of the demonstrations. It goes with a
 mean of 24 frames at 10 frames a second; without a mean, nothing counts as moved."""
@@ -45,17 +50,23 @@ class ObjectFrames(nn.Module):
     Beside the state there are means of the last ones: views, and the state is view 0. An object gives a frame in each view, where
     it stands in that. What is seen from there is what the view shows, and the hands as they are now.
 
+    With ``fourier``, the map in a frame may bend with where its object stands, as the last view shows it
+    (:class:`~lerobot_policy_hdril.fourier.FourierFeatures`).
+
     Args:
         state_names: names of the state's numbers, hands and objects.
         objects: which of them are objects'.
         action_names: names of an action's numbers.
         views: the state, and how many means are beside it.
+        fourier: random Fourier features of each object; 0 for none.
 
     Raises:
         ValueError: no object has a pose, or the actions have none.
     """
 
-    def __init__(self, state_names: list[str], objects: list[str], action_names: list[str], views: int = 1) -> None:
+    def __init__(
+        self, state_names: list[str], objects: list[str], action_names: list[str], views: int = 1, fourier: int = 0
+    ) -> None:
         super().__init__()
         poses, hands = pose_groups(state_names), pose_groups(action_names)
         frames = [group for group in poses if state_names[group[0]] in objects]
@@ -71,6 +82,10 @@ class ObjectFrames(nn.Module):
         self.register_buffer("world", torch.eye(7)[6], persistent=False)
         self.views, self.count, self._others = views, 1 + views * len(frames), len(poses) - 1
         self._list_columns(state_names, poses, frames)
+        posed = {column for group in poses for column in group}
+        numbers = [column for column, name in enumerate(state_names) if name in objects and column not in posed]
+        self.fourier = FourierFeatures(self.objects, numbers, fourier) if fourier else None
+        self.width = self.dim + (len(self.fourier.owner) if self.fourier else 0)
 
     objects: Tensor  # (F, 7), columns of a state: the poses of objects
     hands: Tensor  # (G, 7), columns of an action
@@ -153,8 +168,8 @@ class ObjectFrames(nn.Module):
         places = seen[:, :, self.objects[:, :3]]  # (N, V, F, 3)
         return (places[:, 0] - places[:, -1]).norm(dim=-1).median(0).values >= MOVED
 
-    def penalties(self, moved: Tensor, seen: float, still: float, other: float) -> Tensor:
-        """The penalty of each frame's map on each feature (1 + V F, D): one of the three.
+    def penalties(self, moved: Tensor, seen: float, still: float, other: float, bend: bool = False) -> Tensor:
+        """The penalty of each frame's map on each feature (1 + V F, W), the Fourier features last: one of the three.
 
         ``seen`` for the hands as they are now and what has moved, as they are seen from the frame; for the means of the hands
         too, if something has moved, because they tell how it is held; and for what is no pose in the present state, such as an
@@ -176,7 +191,11 @@ class ObjectFrames(nn.Module):
         light = hands_now | no_pose | (from_here & (goes | (hand & moved.any())))
         middle = (from_here & thing) | ((self.seen_from == 0) & self.of_pose & hand & now)
         penalty = torch.full(light.shape, other, dtype=torch.float64, device=moved.device)
-        return penalty.masked_fill(middle, still).masked_fill(light, seen)
+        penalty = penalty.masked_fill(middle, still).masked_fill(light, seen)
+        if self.fourier is None:
+            return penalty
+        bends = (self.fourier.owner == objects) & ~moved[self.fourier.owner]
+        return torch.cat([penalty, torch.where(bends & bend, still, other).to(penalty)], dim=-1)
 
 
 class FusedMaps(nn.Module):
@@ -202,7 +221,7 @@ class FusedMaps(nn.Module):
 
     def __init__(self, frames: ObjectFrames, starts: int, ahead: int) -> None:
         super().__init__()
-        count, hands, grid, numbers = frames.count, len(frames.hands), (starts, ahead), frames.dim + 1
+        count, hands, grid, numbers = frames.count, len(frames.hands), (starts, ahead), frames.width + 1
         self.register_buffer("weight", torch.zeros(count, *grid, 7 * hands, numbers))
         self.register_buffer("plain", torch.zeros(*grid, len(frames.rest), numbers))
         self.register_buffer("whitening", torch.eye(3).expand(count, *grid, hands, 3, 3).clone())
@@ -236,7 +255,7 @@ class FusedMaps(nn.Module):
         leave-one-out errors are too small, because its other windows stay.
 
         Args:
-            features: normalised features (N, D).
+            features: what the maps see (N, W): normalised features, and the Fourier features.
             start: which of the starts a window has (N,).
             frames: the frames of the states.
             seen: states at which windows start, and their means (N, V, S).
@@ -245,9 +264,9 @@ class FusedMaps(nn.Module):
             ridges: penalties on what a frame sees, on what stands still there, and on all else. For each frame, and for the
                 steps that are solved together, the first ones count whose mean squared leave-one-out error of the hands'
                 positions, noise included, is at most :data:`CLEARLY` times the least. What is no pose has the world's. The
-                robust fit takes the first.
+                robust fit takes the first. With these penalties, maps bend where :data:`BENDS` lets them.
             robust: leave out windows that are far off a first fit.
-            noise: covariance (D, D) of noise on the features that the maps are to bear; 0 for none. The penalty grows as if every
+            noise: covariance (W, W) of noise on the features that the maps are to bear; 0 for none. The penalty grows as if every
                 window were seen with such noise, and the covariance of a frame's errors by what the noise adds to them.
             shrinkage: how far correlations of the frames' errors are shrunk towards 0: with 1, frames count as independent.
         """
@@ -267,10 +286,12 @@ class FusedMaps(nn.Module):
         for first in range(last + 1):
             rows = (start == first) & mask[:, 0]
             moved = frames.moved(seen[rows])
-            least = torch.stack([frames.penalties(moved, *penalty) for penalty in ridges])  # (C, 1 + V F, D)
+            least = torch.stack(
+                [torch.stack([frames.penalties(moved, *ridge, bend) for ridge in ridges]) for bend in (False, True)]
+            )
             least = F.pad(least, (0, 1), value=FREE)
             if robust:
-                rows = usual_windows(inputs, action[:, 0].double(), rows, least[0, 0].diag() + rows.sum() * noise)
+                rows = usual_windows(inputs, action[:, 0].double(), rows, least[0, 0, 0].diag() + rows.sum() * noise)
             counts, begin = (mask & rows[:, None]).sum(0).tolist(), 0
             for count, steps in groupby(counts):  # steps that the same rows have are solved together
                 end = begin + len(list(steps))
@@ -297,24 +318,37 @@ class FusedMaps(nn.Module):
         shrinkage: float,
     ) -> None:
         """Of the start ``first``, the steps from ``begin`` on: poses (1 + V F, N, m, G, 7) and the rest of the actions
-        (N, m, A - 7 G) from x (N, D + 1), with the frames' rotations (1 + V F, N, 3, 3) and penalties to choose from for each
-        frame (C, 1 + V F, D + 1)."""
+        (N, m, A - 7 G) from x (N, W + 1), with the frames' rotations (1 + V F, N, 3, 3) and penalties to choose from for each
+        frame, straight and bent (2, C, 1 + V F, W + 1)."""
         poses = _same_signs(poses)
         count, rows, steps, hands = poses.shape[:4]
         outputs = torch.cat([poses.flatten(3), rest.expand(count, *rest.shape)], dim=-1)  # (1 + V F, N, m, A)
+
+        def solve(penalty: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+            """Of penalties (1 + V F, W + 1): the maps, the hands' errors, their second moments, and the mean squared ones."""
+            solution, errors = solve_ridge(x, outputs.flatten(2), penalty.diag_embed() + rows * noise)
+            solution, errors = solution.unflatten(1, (steps, -1)), errors.unflatten(2, (steps, -1))
+            far = errors[..., : 7 * hands].unflatten(-1, (hands, 7))  # (1 + V F, N, m, G, 7)
+            weight = solution[:, :, : 7 * hands].unflatten(2, (hands, 7))
+            second = torch.einsum("fnmgi,fnmgj->fmgij", far, far) / rows
+            second += torch.einsum("fmgid,fmgjd->fmgij", weight @ noise, weight)
+            return solution, far, second, second[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum((-3, -2, -1))
+
         # One after the other: of thousands of windows, all together would take gigabytes.
-        solved = [solve_ridge(x, outputs.flatten(2), one.diag_embed() + rows * noise) for one in least]
-        solution, errors = map(torch.stack, zip(*solved, strict=True))
-        solution, errors = solution.unflatten(2, (steps, -1)), errors.unflatten(3, (steps, -1))
-        far = errors[..., : 7 * hands].unflatten(-1, (hands, 7))  # (C, 1 + V F, N, m, G, 7)
-        second = torch.einsum("cfnmgi,cfnmgj->cfmgij", far, far) / rows
-        weight = solution[:, :, :, : 7 * hands].unflatten(3, (hands, 7))
-        second += torch.einsum("cfmgid,cfmgjd->cfmgij", weight @ noise, weight)
-        error = second[..., :3, :3].diagonal(dim1=-2, dim2=-1).sum((-3, -2, -1))  # (C, 1 + V F)
-        near = error <= CLEARLY * error.min(0).values
-        best, frames = near.int().argmax(0), torch.arange(count, device=error.device)  # the first of them
-        solution, second = solution[best, frames], second[best, frames]
-        far, weight = far[best, frames], weight[best, frames]
+        straight, bent = least
+        solved = [torch.stack(each) for each in zip(*map(solve, straight), strict=True)]
+        near = solved[3] <= CLEARLY * solved[3].min(0).values
+        best, every = near.int().argmax(0), torch.arange(count, device=near.device)  # the first of them
+        chosen = [each[best, every] for each in solved]
+        if (straight != bent).any():
+            other = solve(bent[best, every])
+            better = other[3] < BENDS * chosen[3]
+            chosen = [
+                torch.where(better.view(-1, *[1] * (old.dim() - 1)), new, old)
+                for new, old in zip(other, chosen, strict=True)
+            ]
+        solution, far, second, _ = chosen
+        weight = solution[:, :, : 7 * hands].unflatten(2, (hands, 7))
         here = slice(begin, begin + steps)
         self.plain[first, here] = solution[0, :, 7 * hands :].to(self.plain)
         self.weight[:, first, here] = solution[:, :, : 7 * hands].to(self.weight)
@@ -327,7 +361,7 @@ class FusedMaps(nn.Module):
         self.variance[:, first, here] = (turn + _FLOOR).to(self.variance)
 
     def forward(self, features: Tensor, start: Tensor, frames: ObjectFrames, origins: Origins) -> Tensor:
-        """Features (B, D) at starts (B,) of plans, and the frames' origins there (1 + V F, B), to actions (B, M, A) in the
+        """Features (B, W) at starts (B,) of plans, and the frames' origins there (1 + V F, B), to actions (B, M, A) in the
         world."""
         inputs = F.pad(features, (0, 1), value=1.0)[:, None, None]
         told = (self.weight.index_select(1, start) * inputs).sum(-1).unflatten(-1, (-1, 7))  # (1 + V F, B, M, G, 7)
@@ -363,10 +397,10 @@ def _correlation(far: Tensor, weight: Tensor, whitening: Tensor, rotation: Tenso
 
     Args:
         far: leave-one-out errors of positions in each frame (1 + V F, N, m, G, 3).
-        weight: of the maps (1 + V F, m, G, 3, D + 1).
+        weight: of the maps (1 + V F, m, G, 3, W + 1).
         whitening: (1 + V F, m, G, 3, 3).
         rotation: of the frames (1 + V F, N, 3, 3).
-        noise: covariance of what is seen (D + 1, D + 1).
+        noise: covariance of what is seen (W + 1, W + 1).
     """
     apart = torch.einsum("fnij,fmgjk,fnmgk->fnmgi", rotation, whitening, far)
     correlation = torch.einsum("fnmgi,hnmgi->mgfh", apart, apart) / far.shape[1]

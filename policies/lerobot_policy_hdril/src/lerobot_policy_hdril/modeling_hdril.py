@@ -26,7 +26,7 @@ from lerobot_policy_hdril.fusion import FusedMaps, ObjectFrames
 from lerobot_policy_hdril.graph import quaternion_groups
 from lerobot_policy_hdril.hand_noise import HandNoise
 from lerobot_policy_hdril.overrides import check_overrides
-from lerobot_policy_hdril.planner import Planner
+from lerobot_policy_hdril.planner import Planner, begin_weights
 from lerobot_policy_hdril.player import Choice, PlaybackState, advance
 from lerobot_policy_hdril.provenance import read_origin
 from lerobot_policy_hdril.weights import load_weights
@@ -82,6 +82,7 @@ class HDRILPolicy(PreTrainedPolicy):
         config.validate_features()
         self.config: HDRILConfig = config
         self._demonstrations: Demonstrations | None = None
+        self._begin_weights: Tensor | None = None
         if dataset_meta is not None:
             config.set_dataset_feature_metadata(dataset_meta.features)
             data = Demonstrations(dataset_meta, config.subtask_key, config.device or "cpu", config.filters)
@@ -143,7 +144,9 @@ class HDRILPolicy(PreTrainedPolicy):
         self.frames = self.fused = None
         if fused:
             views = 1 + len(config.filters)
-            frames = self.frames = ObjectFrames(names, config.environment_names, config.action_names, views)
+            frames = self.frames = ObjectFrames(
+                names, config.environment_names, config.action_names, views, config.fourier_features
+            )
             starts = -(-self.capacity // self.ahead)
             self.fused = nn.ModuleList(FusedMaps(frames, starts, self.ahead) for _ in config.primitives)
             self.register_buffer("feature_mean", torch.zeros(frames.dim))
@@ -261,6 +264,9 @@ class HDRILPolicy(PreTrainedPolicy):
             self._learned.mark_fitted()
         if changed:
             self.config.training_data = self._learned.records()
+        if self.config.planner_balance and (changed or self._begin_weights is None):
+            counts = data.beginnings(self._learned.mask)
+            self._begin_weights = begin_weights(counts, self.config.planner_balance)
 
     def _check_learned(self) -> None:
         if not self.config.primitive_lengths:
@@ -305,9 +311,10 @@ class HDRILPolicy(PreTrainedPolicy):
     def planner_loss(
         self, history: History, window: Window, generator: torch.Generator | None = None
     ) -> tuple[Tensor, float]:
-        """Cross-entropy over all frames of the episodes, and the share of them at which the most probable answer is the
-        right one; plus cross-entropy over the frames at which windows start, each seen without what was before it. That
-        is all that :meth:`predict_action_chunk` has where no episode runs. ``generator`` draws what the planner leaves out."""
+        """Cross-entropy over all frames of the episodes, in which rare beginnings count more (``planner_balance``), and the share
+        of frames at which the most probable answer is the right one; plus cross-entropy over the frames at which windows start,
+        each seen without what was before it. That is all that :meth:`predict_action_chunk` has where no episode runs.
+        ``generator`` draws what the planner leaves out."""
         told = (history.playing, history.elapsed) if self.planner.steps else (None, None)
         nothing = torch.zeros_like(window.primitive)[:, None]
         alone_told = (nothing + len(self.config.primitives), nothing) if self.planner.steps else (None, None)
@@ -318,7 +325,11 @@ class HDRILPolicy(PreTrainedPolicy):
         right, first = history.primitive, window.primitive
         if self.planner.steps:  # 0 is that the primitive goes on
             right, first = torch.where(history.begins, right + 1, 0), first + 1
-        loss = F.cross_entropy(logits[history.mask], right[history.mask]) + F.cross_entropy(alone[:, 0], first)
+        each = F.cross_entropy(logits[history.mask], right[history.mask], reduction="none")
+        if self._begin_weights is not None:
+            weights = self._begin_weights[history.playing, history.primitive].where(history.begins, 1.0)
+            each = each * weights[history.mask]
+        loss = each.mean() + F.cross_entropy(alone[:, 0], first)
         hits = (logits.argmax(-1) == right)[history.mask]
         return loss, hits.float().mean().item()
 
@@ -343,7 +354,10 @@ class HDRILPolicy(PreTrainedPolicy):
         """What the fused maps see of states and of the means of the last ones (B, 1 + W, S); and the origins of their frames."""
         assert self.frames is not None
         origins = self.frames.origins(seen)
-        return (self.frames.features(seen, origins) - self.feature_mean) / self.feature_std, origins
+        features = (self.frames.features(seen, origins) - self.feature_mean) / self.feature_std
+        if self.frames.fourier is not None:
+            features = torch.cat([features, self.frames.fourier(seen[:, -1])], dim=-1)
+        return features, origins
 
     def _fused(self, seen: Tensor, primitive: Tensor, elapsed: Tensor) -> Tensor:
         """Normalised outputs (B, M, A + S) of the fused maps; 0 for the states, which they do not predict."""

@@ -12,6 +12,7 @@ from lerobot_policy_hdril.configuration_hdril import HDRILConfig
 _TRAINING = {
     "kl_weight",
     "state_loss_weight",
+    "planner_balance",
     "planner_batch_size",
     "planner_dropout",
     "subtask_key",

@@ -9,6 +9,19 @@ from lerobot_policy_hdril.decoders import run_gru
 from lerobot_policy_hdril.graph import pose_groups
 from lerobot_policy_hdril.interaction import make_interaction
 
+MOST = 10.0
+"""No beginning counts more than so many times as much as the most frequent one: what one demonstration shows may be chance."""
+
+
+def begin_weights(counts: Tensor, balance: float) -> Tensor:
+    """How much the beginnings of primitives count in the planner's loss (K + 1, K): (the most frequent one's count / its own) to
+    the power of ``balance``, and no more than :data:`MOST`. With 0, all count alike.
+
+    Args:
+        counts: how often each primitive begins after each, and where none was before (K + 1, K).
+    """
+    return (counts.max() / counts.clamp_min(1)).pow(balance).clamp_max(MOST)
+
 
 class Planner(nn.Module):
     """A graph GRU over the states seen so far, and a softmax over primitives at every frame.
