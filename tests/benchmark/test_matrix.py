@@ -113,6 +113,7 @@ def test_what_decides_a_result_is_in_its_settings_and_nothing_else(tmp_path: Pat
         assert not same(train, **changes), changes
     assert not same(evaluate, options=("--policy.rollout=open_loop",))
     assert not same(record, perturb=0.001)
+    assert not same(record, stray=0.001)
     assert not same(record, task="table_lift:push=1")
     config = tmp_path / "train.yaml"
     config.write_text(train.config.read_text())
@@ -145,7 +146,7 @@ def test_a_change_of_hdril_does_not_touch_what_it_does_not_make(monkeypatch: pyt
         (lambda v: v["tables"][0].update(training_seeds=[1, 1]), "training_seeds has 1 twice"),
         (lambda v: v["tables"][0].update(demonstrations=[50, 50]), "demonstrations has 50 twice"),
         (lambda v: v["tables"][0].update(policies=["hdril", "hdril"]), "policies has 'hdril' twice"),
-        (lambda v: v["data"]["nominal"].update(perturb=-0.1), "data nominal: perturb must not be negative, got -0.1"),
+        (lambda v: v["data"]["nominal"].update(perturb=-0.1), "data nominal: perturb must be from 0 to 0.03 m, got -0.1"),
         (lambda v: v.update(name="two words"), "name must be of letters, digits, .* got 'two words'"),
         (lambda v: v["policies"]["act"].update(steps=0), "policy act: give steps, at least 1, or else minutes; got 0 steps"),
         (lambda v: v["policies"]["act"].update(steps=-1, minutes=[5]), "policy act: give steps, at least 1, or else minutes"),

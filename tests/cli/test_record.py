@@ -112,7 +112,7 @@ def test_a_dataset_of_another_version_is_not_published_as_made_by_this_one(
 @pytest.mark.parametrize("path", sorted(Path("configs/record").glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_recipe_can_be_recorded_and_names_its_own_command(path: Path) -> None:
     config = draccus.parse(RecordConfig, config_path=path, args=[])
-    recipe = Recipe(config.task, config.noise, perturb=config.perturb)
+    recipe = Recipe(config.task, config.noise, perturb=config.perturb, stray=config.stray)
     assert recipe.make_env().task == config.task
     assert path.read_text().startswith(f"# hdril-record --config_path={path.as_posix()}\n")
     assert config.root == Path("outputs") / path.stem / "dataset"

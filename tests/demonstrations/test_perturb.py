@@ -36,9 +36,9 @@ class Still:
         return Decision(self.action)
 
 
-def offsets(opening: float, deviation: float, seed: int = 0, frames: int = 2000) -> np.ndarray:
+def offsets(opening: float, deviation: float, seed: int = 0, frames: int = 2000, stray: float = 0.0) -> np.ndarray:
     """What is sent less what was meant (T, 2, 3), m."""
-    actor = PerturbedActor(Still(opening), deviation)
+    actor = PerturbedActor(Still(opening), deviation, stray)
     actor.reset(seed)
     decisions = [actor.act(OBSERVATION) for _ in range(frames)]
     meant, sent = (np.stack(rows) for rows in zip(*((d.action, d.sent) for d in decisions), strict=True))
@@ -61,14 +61,48 @@ def test_hands_that_may_hold_one_body_are_moved_alike() -> None:
     assert noise.std() > 0.005
 
 
-@pytest.mark.parametrize("deviation", [-0.001, 0.031])
-def test_a_deviation_out_of_range_is_refused(deviation: float) -> None:
-    with pytest.raises(ValueError, match=rf"^perturb must be from 0 to 0.03 m, got {deviation}$"):
-        Recipe("table_lift", perturb=deviation)
+def test_now_and_then_a_hand_strays() -> None:
+    """Each by itself, for 6 to 14 frames, in a share of the frames that the rate tells."""
+    away = offsets(1.0, 0.0, stray=0.03, frames=20_000)
+    np.testing.assert_array_equal(away[:300], offsets(1.0, 0.0, stray=0.03, frames=300))
+    assert (away[:300] != offsets(1.0, 0.0, seed=1, stray=0.03, frames=300)).any()
+    strays = np.abs(away).max(axis=2) > 0.0  # (T, 2)
+    assert np.corrcoef(strays.T)[0, 1] == pytest.approx(0.0, abs=0.05)
+    places = []
+    for side in range(2):
+        changes = np.flatnonzero((np.diff(away[:, side], axis=0, prepend=0.0) != 0.0).any(axis=1))
+        runs = np.diff(changes)
+        lengths = runs[strays[changes[:-1], side]]
+        assert set(lengths) <= set(range(6, 15))
+        assert {6, 14} <= set(lengths)
+        places.append(away[changes[strays[changes, side]], side])
+        assert strays[:, side].mean() == pytest.approx(10.0 / (10.0 + 49.0), rel=0.15)
+    assert np.concatenate(places).std(axis=0) == pytest.approx(np.full(3, 0.03), rel=0.15)
 
 
-def test_the_robot_gets_the_noise_and_the_record_does_not() -> None:
-    recipe = Recipe("table_lift", Noise(0.0), perturb=0.005)
+def test_strays_join_the_noise_of_every_frame() -> None:
+    noise, both = offsets(1.0, 0.01, frames=200), offsets(1.0, 0.01, stray=0.03, frames=200)
+    np.testing.assert_allclose(both - noise, offsets(1.0, 0.0, stray=0.03, frames=200), atol=1e-12)
+
+
+def test_hands_that_may_hold_one_body_stray_alike() -> None:
+    away = offsets(0.0, 0.0, stray=0.03, frames=300)
+    np.testing.assert_allclose(away[:, 0], away[:, 1], atol=1e-12)
+    assert away.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "deviation", "most"),
+    [("perturb", -0.001, 0.03), ("perturb", 0.031, 0.03), ("stray", -0.1, 0.1), ("stray", 0.11, 0.1)],
+)
+def test_a_deviation_out_of_range_is_refused(name: str, deviation: float, most: float) -> None:
+    with pytest.raises(ValueError, match=rf"^{name} must be from 0 to {most} m, got {deviation}$"):
+        Recipe("table_lift", **{name: deviation})
+
+
+@pytest.mark.parametrize("noise", [{"perturb": 0.005}, {"perturb": 0.005, "stray": 0.02}])
+def test_the_robot_gets_the_noise_and_the_record_does_not(noise: dict[str, float]) -> None:
+    recipe = Recipe("table_lift", Noise(0.0), **noise)
     env, expert = recipe.make_env(), recipe.make_expert()
     with closing(env):
         episode = demonstrate(env, expert, 11)

@@ -28,10 +28,10 @@ def test_a_card_has_the_recipe_of_the_version_that_recorded(made_up: Callable[..
 
 
 def test_the_command_of_a_card_makes_the_dataset(made_up: Callable[..., Episode], tmp_path: Path) -> None:
-    recipe = Recipe("table_lift", Noise(0.003), perturb=0.004)
+    recipe = Recipe("table_lift", Noise(0.003), perturb=0.004, stray=0.02)
     write_dataset(tmp_path / "set", Provenance(recipe, (6, 7)), [made_up(6), made_up(7)])
     used = dataset_card("user/name", tmp_path / "set").partition("## Use")[2]
     command = used.partition("hdril-record ")[2].partition("lerobot-train")[0]
     config = draccus.parse(RecordConfig, args=command.replace("\\", " ").split())
-    assert Recipe(config.task, config.noise, perturb=config.perturb) == recipe
+    assert Recipe(config.task, config.noise, perturb=config.perturb, stray=config.stray) == recipe
     assert (config.num_episodes, config.seed, config.repo_id) == (2, 6, "user/name")

@@ -7,12 +7,15 @@ from typing import Any
 
 import pytest
 import torch
+from lerobot.configs.policies import PreTrainedConfig
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+from lerobot.policies.factory import make_policy
 from lerobot_policy_hdril import HDRILConfig, HDRILPolicy
-from lerobot_policy_hdril.planner import Planner
+from lerobot_policy_hdril.planner import Planner, begin_weights
 from lerobot_policy_hdril.presets import PRESETS
 from torch import Tensor
 
-from tests.policies.tools import BATCH, FRAMES, SMALL, build
+from tests.policies.tools import BATCH, FRAMES, SMALL, STARTS, assert_same, build, demonstrations, edit, read, tensors
 
 AXES = ("x", "y", "z", "qx", "qy", "qz", "qw")
 NAMES = [f"{node}.{axis}" for node in ("left_ee", "right_ee", "cup") for axis in AXES] + ["cup.size"]
@@ -140,7 +143,8 @@ def test_the_planner_leaves_something_out_of_episodes_and_of_single_frames(metad
 
 
 def test_the_papers_models_and_once_a_primitive_have_the_plain_planner() -> None:
-    other = {name for name, values in PRESETS.items() if values["planner_dropout"] or values["planner_scale"]}
+    options = ("planner_balance", "planner_dropout", "planner_scale")
+    other = {name for name, values in PRESETS.items() if any(values[option] for option in options)}
     assert other == {"hdril_reactive", "network_reactive"}
 
 
@@ -158,9 +162,70 @@ def test_dropout_is_for_training_and_decided_by_the_batch(metadata) -> None:
     assert losses(training=False) == [without] * 3
 
 
+@pytest.fixture
+def mended(copy: Path) -> LeRobotDatasetMetadata:
+    """In two of the six episodes the last primitive is broken off, and the third begins once more; in one of them, again."""
+    again = {2: [62], 4: [62, 66]}
+    edit(
+        copy, "subtask_index", lambda episode, frame, label: 2 if frame >= min(again.get(episode, [FRAMES])) else label
+    )
+    edit(copy, "subtask_start", lambda episode, frame, value: frame in STARTS or frame in again.get(episode, []))
+    return read(copy)
+
+
+def test_beginnings_are_counted_by_what_was_before(mended) -> None:
+    data = demonstrations(build(mended, preset="hdril_reactive", hidden_dim=32))
+    usual = torch.zeros(7, 6, dtype=torch.long)
+    usual[6, 0] = usual[0, 1] = usual[1, 2] = usual[2, 3] = usual[3, 4] = usual[4, 5] = 1
+    after, again = torch.zeros_like(usual), torch.zeros_like(usual)
+    after[5, 2], again[2, 2] = 1, 1
+    assert torch.equal(data.beginnings(torch.ones(6, dtype=torch.bool)), 6 * usual + 2 * after + again)
+    assert torch.equal(data.beginnings(torch.arange(6) == 4), usual + after + again)
+    assert torch.equal(data.beginnings(torch.arange(6) < 2), 2 * usual)
+
+
+def test_rare_beginnings_count_more_and_no_more_than_ten_times() -> None:
+    counts = torch.tensor([[400, 100], [4, 0], [1, 400]])
+    torch.testing.assert_close(begin_weights(counts, 0.5), torch.tensor([[1.0, 2.0], [10.0, 10.0], [10.0, 1.0]]))
+    torch.testing.assert_close(begin_weights(counts, 0.25)[1:, 0], torch.tensor([100.0, 400.0]) ** 0.25)
+    assert torch.equal(begin_weights(counts, 0.0), torch.ones(3, 2))
+
+
+def test_the_loss_of_a_beginning_is_weighted_and_that_of_all_else_is_not(mended) -> None:
+    plain, policy = (
+        build(mended, preset="hdril_reactive", hidden_dim=32, planner_balance=balance).eval() for balance in (0.0, 1.0)
+    )
+    assert_same(tensors(plain), tensors(policy))
+    data, rows = demonstrations(policy), torch.tensor([2 * FRAMES, 4 * FRAMES])
+    history, window = data.history(rows), data.window(rows, 2, 2)
+    told, _ = policy.planner(policy.normalise(history.state), history.state, None, history.playing, history.elapsed)
+    right = torch.where(history.begins, history.primitive + 1, 0)
+    each = torch.nn.functional.cross_entropy(told[history.mask], right[history.mask], reduction="none")
+    more = torch.zeros_like(history.elapsed, dtype=torch.float32)
+    more[:, 62], more[1, 66] = 6 / 2 - 1, 6 / 1 - 1  # six episodes begin as usual, two thus, and one again
+    difference = policy.planner_loss(history, window)[0] - plain.planner_loss(history, window)[0]
+    torch.testing.assert_close(difference, (each * more[history.mask]).mean())
+
+
+def test_a_resumed_policy_weighs_beginnings_as_before(mended, tmp_path: Path) -> None:
+    policy = build(mended, preset="hdril_reactive", hidden_dim=32, planner_dropout=0.0)
+    policy.save_pretrained(tmp_path)
+    config = PreTrainedConfig.from_pretrained(tmp_path)
+    config.pretrained_path = tmp_path
+    resumed = make_policy(config, ds_meta=mended)
+    losses = [float(p.train().forward({"index": BATCH})[1]["planner_loss"]) for p in (policy, resumed)]
+    assert losses[0] == losses[1]
+
+
 @pytest.mark.parametrize(
     ("values", "told"),
     [
+        (
+            {"planner_balance": 1.1},
+            r"^policy\.planner_balance must be from 0 to 1, and is for .*; got 1\.1 and learned$",
+        ),
+        ({"planner_balance": -0.1}, r"^policy\.planner_balance must be from 0 to 1"),
+        ({"planner_balance": 0.5, "termination": "length"}, r"policy\.termination=learned; got 0\.5 and length$"),
         ({"planner_dropout": 1.0}, r"^policy\.planner_dropout must be from 0 to less than 1, got 1\.0$"),
         ({"planner_dropout": -0.1}, r"^policy\.planner_dropout must be from 0 to less than 1"),
         ({"planner_scale": -0.05}, r"^policy\.planner_scale must be 0 or a length in m"),

@@ -27,8 +27,8 @@ CITATION = """@inproceedings{xie2020deep,
   year = {2020}
 }"""
 _CHOICES = ("preset", "interaction", "skip", "state_skip", "per_primitive", "decoder", "coordinates", "latent", "termination",
-            "filter_frames", "long_filter_frames", "robust", "hand_noise", "planner_balance", "planner_dropout", "planner_scale", "rollout",
-            "replan_every", "hidden_dim")  # fmt: skip
+            "filter_frames", "long_filter_frames", "robust", "hand_noise", "planner_balance", "planner_dropout",
+            "planner_scale", "rollout", "replan_every", "hidden_dim")  # fmt: skip
 
 
 def simulated_task(config: HDRILConfig, dataset_meta: LeRobotDatasetMetadata | None) -> str | None:
