@@ -8,9 +8,11 @@ from typing import Any
 import pytest
 import torch
 from lerobot_policy_hdril import HDRILConfig
+from lerobot_policy_hdril.dynamics import solve_ridge
 from lerobot_policy_hdril.fourier import REACH, SPREAD, TURN, FourierFeatures
-from lerobot_policy_hdril.fusion import RIDGES, FusedMaps, ObjectFrames
+from lerobot_policy_hdril.fusion import BENDS, RIDGES, SHUT_OUT, FusedMaps, ObjectFrames
 from torch import Tensor
+from torch.nn import functional as F
 
 from tests.policies.test_checkpoint import load, without
 from tests.policies.test_reactive import ACTION, CUP, SHELF, SHRINKAGE, STATE, at_cup, generator, scenes
@@ -41,9 +43,9 @@ def test_the_features_of_two_states_agree_as_a_gaussian_of_their_distance_says(
     states[2, STATE.index(name)] += 3.0 * scale
     seen = made(states).unflatten(1, (2, -1))
     for k in range(2):
-        near, far = (float((seen[0, k] * seen[i, k]).mean()) for i in (1, 2))
+        near, far = (float((seen[0, k] * seen[i, k]).sum()) for i in (1, 2))
         expected = (0.607, 0.011) if k in objects else (1.0, 1.0)
-        assert (near, far) == pytest.approx(expected, abs=0.08)
+        assert (near / 32.0, far / 32.0) == pytest.approx(expected, abs=0.08)
 
 
 def test_a_pose_has_the_same_features_whatever_the_sign_of_its_quaternion() -> None:
@@ -62,6 +64,13 @@ def test_the_hand_and_its_opening_are_not_among_them() -> None:
     torch.testing.assert_close(frames.fourier(other), frames.fourier(states))
 
 
+def test_mixed_precision_does_not_touch_them() -> None:
+    made, states = features(32).float(), scenes(20, 11).float()
+    with torch.autocast("cpu", torch.bfloat16):
+        coarse = made(states)
+    assert torch.equal(coarse, made(states))
+
+
 def test_a_size_that_hardly_varies_does_not_count() -> None:
     made, states = features(8), scenes(50, 9)
     states[:, SIZE] = 0.3 + 1e-6 * torch.rand(50, generator=generator(1), dtype=torch.float64)
@@ -69,6 +78,12 @@ def test_a_size_that_hardly_varies_does_not_count() -> None:
     same = states.clone()
     same[:, SIZE] = 0.3
     torch.testing.assert_close(made(same), made(states), atol=1e-3, rtol=0)
+
+
+def test_more_features_are_no_other_kernel() -> None:
+    states = scenes(2, 12)
+    sizes = [float(features(count)(states).square().sum(-1).mean()) for count in (64, 4096)]
+    assert sizes == pytest.approx([64.0, 64.0], rel=0.2)  # of two objects
 
 
 def told(count: int, fourier: int, straight: bool, seed: int = 2) -> tuple[Tensor, Tensor]:
@@ -112,10 +127,44 @@ def off(count: int, fourier: int, straight: bool) -> float:
 
 
 def test_maps_bend_with_where_an_object_stands() -> None:
-    assert off(400, 32, straight=False) < 0.5 * off(400, 0, straight=False)
+    assert off(400, 32, straight=False) < 0.6 * off(400, 0, straight=False)
 
 
-@pytest.mark.parametrize(("count", "straight", "most"), [(15, True, 1.05), (15, False, 1.05), (400, True, 1.3)])
+def test_each_frame_bends_by_its_own_errors() -> None:
+    """Each frame, solved alone: the penalties by the errors of straight maps, then the bent map if its error is no larger."""
+    frames, draw = ObjectFrames(STATE, OBJECTS, ACTION, 1, 6).double(), generator(50)
+    seen, ridges = scenes(150, 40)[:, None], [(10.0, 10.0, 10.0), (1e-2, 1.0, 10.0)]
+    target = at_cup(seen[:, 0])
+    target[:, :3] += 2.0 * (seen[:, 0, 7:10] - 0.5).clamp_min(0.0) + 0.02 * torch.randn(150, 3, generator=draw).double()
+    action = torch.cat([target, torch.rand(150, 1, generator=draw).double()], dim=-1)[:, None]
+    plain = frames.features(seen)
+    assert frames.fourier is not None
+    features = torch.cat([(plain - plain.mean(0)) / plain.std(0), frames.fourier(seen[:, 0])], dim=-1)
+    noise = torch.diag(1e-3 * torch.rand(frames.width, generator=draw).double())
+    maps, start, mask = FusedMaps(frames, 1, 1).double(), torch.zeros(150).long(), torch.ones(150, 1, dtype=torch.bool)
+    maps.fit(features, start, frames, seen, action, mask, ridges, False, noise, SHRINKAGE)
+    x, noise = torch.cat([features, torch.ones(150, 1).double()], dim=-1), F.pad(noise, (0, 1, 0, 1))
+    poses, moved, bent = frames.targets(action, seen)[:, :, 0, 0, :3], frames.moved(seen), []
+    for frame in range(frames.count):
+
+        def solve(ridge: tuple[float, float, float], bend: bool, frame: int = frame) -> tuple[float, Tensor, Tensor]:
+            penalty = F.pad(frames.penalties(moved, *ridge, bend)[frame], (0, 1), value=1e-6)
+            solved, far = solve_ridge(x, poses[frame], torch.diag(penalty) + 150 * noise)
+            spread = far.T @ far / 150 + solved @ noise @ solved.T
+            return float(spread.trace()), solved, spread
+
+        straight = [solve(ridge, False) for ridge in ridges]
+        best = next(c for c in range(2) if straight[c][0] <= 2.0 * min(score for score, _, _ in straight))
+        other = solve(ridges[best], True)
+        bent.append((best, other[0] < BENDS * straight[best][0] and other[0] != straight[best][0]))
+        _, solved, spread = other if bent[-1][1] else straight[best]
+        torch.testing.assert_close(maps.weight[frame, 0, 0, :3], solved)
+        root = maps.whitening[frame, 0, 0, 0]
+        torch.testing.assert_close(root @ root, torch.linalg.inv(spread + 1e-7 * torch.eye(3)))
+    assert {yes for _, yes in bent[1:]} == {True, False}
+
+
+@pytest.mark.parametrize(("count", "straight", "most"), [(15, True, 1.05), (15, False, 1.05), (400, True, 1.05)])
 def test_what_may_bend_costs_little_where_nothing_does_or_few_demonstrations_show_it(
     count: int, straight: bool, most: float
 ) -> None:
@@ -127,12 +176,12 @@ def test_only_what_stands_still_bends_the_maps_of_its_own_frames() -> None:
     penalties = frames.penalties(torch.tensor([False, True]), 1.0, 30.0, 300.0, bend=True)
     assert penalties.shape == (1 + 3 * 2, frames.width) == (7, frames.dim + 2 * 4)
     bent = (penalties[:, frames.dim :] == 30.0).unflatten(1, (2, 4))
-    assert (penalties[:, frames.dim :][~bent.flatten(1)] == 300.0).all()
+    assert (penalties[:, frames.dim :][~bent.flatten(1)] == SHUT_OUT).all()
     assert bent.all(-1).tolist() == bent.any(-1).tolist()
     # Frames: the world, then cup and shelf in each of three views.
     assert bent.any(-1).tolist() == [[False, False], *([[True, False], [False, False]] * 3)]
     straight = frames.penalties(torch.tensor([False, True]), 1.0, 30.0, 300.0)
-    assert (straight[:, frames.dim :] == 300.0).all()
+    assert (straight[:, frames.dim :] == SHUT_OUT).all()
     assert torch.equal(straight[:, : frames.dim], penalties[:, : frames.dim])
 
 

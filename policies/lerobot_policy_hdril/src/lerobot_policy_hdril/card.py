@@ -27,8 +27,8 @@ CITATION = """@inproceedings{xie2020deep,
   year = {2020}
 }"""
 _CHOICES = ("preset", "interaction", "skip", "state_skip", "per_primitive", "decoder", "coordinates", "latent", "termination",
-            "filter_frames", "long_filter_frames", "robust", "hand_noise", "planner_balance", "planner_dropout",
-            "planner_scale", "rollout", "replan_every", "hidden_dim")  # fmt: skip
+            "filter_frames", "long_filter_frames", "robust", "hand_noise", "fourier_features", "split_forms", "planner_balance",
+            "planner_dropout", "planner_scale", "rollout", "replan_every", "hidden_dim")  # fmt: skip
 
 
 def simulated_task(config: HDRILConfig, dataset_meta: LeRobotDatasetMetadata | None) -> str | None:
@@ -139,12 +139,26 @@ def _features(config: HDRILConfig) -> str:
     return _table(("feature", "shape", "numbers"), rows)
 
 
+def _names(config: HDRILConfig) -> list[str]:
+    """Of the forms: that of the primitive, and beside it which numbers begin in the upper half where it has several."""
+    told = [config.action_names[column] for column in config.halved]
+    names = config.form_names
+
+    def beside(form: list[int]) -> str:
+        upper = [name for name, high in zip(told, form[1:], strict=True) if high]
+        return f" (begins with {', '.join(upper) or 'no number'} in the upper half)"
+
+    return [
+        name + (beside(form) if names.count(name) > 1 else "") for name, form in zip(names, config.forms, strict=True)
+    ]
+
+
 def _primitives(config: HDRILConfig) -> str:
     def length(low: int, high: int) -> str:
         return f"{low}" if low == high else f"{low} to {high}"
 
     lengths = [length(*run) if run[1] else "not learned" for run in config.primitive_lengths]
-    return _table(("primitive", "frames"), list(zip(config.primitives, lengths, strict=False)))
+    return _table(("primitive", "frames"), list(zip(_names(config), lengths, strict=False)))
 
 
 def _training(

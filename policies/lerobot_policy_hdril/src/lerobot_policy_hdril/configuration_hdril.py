@@ -12,7 +12,7 @@ from lerobot.optim.optimizers import AdamWConfig
 from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
-from lerobot_policy_hdril.graph import feature_names
+from lerobot_policy_hdril.graph import feature_names, pose_groups
 from lerobot_policy_hdril.presets import PLAIN, PRESETS
 from lerobot_policy_hdril.provenance import TrainingData
 from lerobot_policy_hdril.schema import LANGUAGE, SUBTASK_KEY
@@ -28,14 +28,14 @@ Termination = Literal["length", "learned"]
 
 
 _FREE = (
-    "hidden_dim", "termination", "filter_frames", "long_filter_frames", "robust", "hand_noise", "planner_balance",
-    "planner_dropout", "planner_scale", "replan_every",
+    "hidden_dim", "termination", "filter_frames", "long_filter_frames", "robust", "hand_noise", "split_forms",
+    "planner_balance", "planner_dropout", "planner_scale", "replan_every",
 )  # fmt: skip
 """Options that may differ from the preset's value."""
 _FILTERS = ("filter_frames", "long_filter_frames")
 """Options that give the lengths of the means, frames."""
 _RIDGES = ("ridge", "ridge_other")
-_BEFORE = PLAIN | {"coordinates": "absolute", "fourier_features": 0}
+_BEFORE = PLAIN | {"coordinates": "absolute", "fourier_features": 0, "split_forms": False}
 """Values of options whose default was another one, or which were not there, when a checkpoint without them was saved."""
 
 
@@ -60,8 +60,8 @@ class HDRILConfig(SingleFrameConfig):
     preset: str = ""
     """Name of a model in :data:`~lerobot_policy_hdril.presets.PRESETS`, which then decides the values of this group, and
     ``hidden_dim``. ``hidden_dim``, ``termination``, ``filter_frames``, ``long_filter_frames``, ``robust``, ``hand_noise``,
-    ``planner_balance``, ``planner_dropout``, ``planner_scale`` and ``replan_every`` may be given nevertheless, where the model
-    has a use for them. Empty to set them one by one. Once the policy has learned it is a name only."""
+    ``split_forms``, ``planner_balance``, ``planner_dropout``, ``planner_scale`` and ``replan_every`` may be given nevertheless,
+    where the model has a use for them. Empty to set them one by one. Once the policy has learned it is a name only."""
     interaction: Interaction = "object"
     """Graph attention: ``none``; ``scalar``, the paper's node per number of the state; ``object``, a node per object."""
     skip: bool = True
@@ -86,10 +86,15 @@ class HDRILConfig(SingleFrameConfig):
     """When a primitive is over. ``length``: after its shortest recorded length, as soon as the planner prefers another.
     ``learned``: the planner decides at every frame whether it goes on or one begins, maybe the same again; for
     demonstrations in which primitives are broken off and repeated."""
+    split_forms: bool = True
+    """Whether a primitive that begins with a hand closed, or another number of the actions that is no pose in the other half of
+    its range, has a model of its own (:mod:`~lerobot_policy_hdril.forms`). For ``coordinates=fused`` alone; it is false with
+    others."""
     planner_balance: float = 0.5
-    """How much more the beginnings that are rare count when the planner learns, 0 (not) to 1 (as much as all frequent ones
-    together): few demonstrations show how something is mended (:func:`~lerobot_policy_hdril.planner.begin_weights`). For
-    ``termination=learned`` alone; it is 0 with others."""
+    """How much more the beginnings that are rare count when the planner learns: 0, not; 1, each in total as much as the most
+    frequent one. None counts more than ten times. Few demonstrations show how something is mended
+    (:func:`~lerobot_policy_hdril.planner.begin_weights`). The planner's probabilities are then higher for what is rare than its
+    share. For ``termination=learned`` alone; it is 0 with others."""
     planner_dropout: float = 0.2
     """Share of the planner's embedded states and hidden states that training leaves out, so that few demonstrations teach more
     (:class:`~lerobot_policy_hdril.planner.Planner`)."""
@@ -144,9 +149,9 @@ class HDRILConfig(SingleFrameConfig):
     independent. Estimated correlations are not exact, and maps that are nearly the same would be played off against each
     other."""
     fourier_features: int = 32
-    """How many random Fourier features of each object's pose a fused map in its frame sees, so that it can bend with where that
-    stands (:class:`~lerobot_policy_hdril.fourier.FourierFeatures`); 0: the maps are linear. For ``coordinates=fused`` alone; it
-    is 0 with others."""
+    """How many random Fourier features of each object's pose and of all sizes a fused map in its frame sees, so that it can bend
+    with where that stands (:class:`~lerobot_policy_hdril.fourier.FourierFeatures`); 0: the maps are linear. For
+    ``coordinates=fused`` alone; it is 0 with others."""
     min_std: float = 0.01
     """Floor of the deviations that normalise the data, m or dimensionless: numbers that hardly vary must not dominate."""
 
@@ -162,6 +167,8 @@ class HDRILConfig(SingleFrameConfig):
     """Column of the dataset that labels each frame with its primitive. A dataset without ``subtask_index`` may have LeRobot's
     ``language_persistent`` instead, with rows of the style ``subtask``."""
     primitives: list[str] = field(default_factory=list)
+    forms: list[list[int]] = field(default_factory=list)
+    """A model for each: the label of its primitive, and which numbers of the actions begin in the upper half of their range."""
     primitive_lengths: list[list[int]] = field(default_factory=list)
     """Shortest and longest run of each primitive in the episodes learned from, frames; [0, 0] for a primitive that is in
     none of them, which is never played. Empty before training."""
@@ -208,6 +215,8 @@ class HDRILConfig(SingleFrameConfig):
                 self.hand_noise = 0.0
             if "fourier_features" not in self._given:
                 self.fourier_features = 0
+            if "split_forms" not in self._given:
+                self.split_forms = False
         if self.termination != "learned" and "planner_balance" not in self._given:
             self.planner_balance = 0.0
         if self.interaction != "object" and "planner_scale" not in self._given:
@@ -259,6 +268,8 @@ class HDRILConfig(SingleFrameConfig):
             )
         if not 0.0 < self.fusion_shrinkage <= 1.0:
             raise ValueError(f"policy.fusion_shrinkage must be above 0 and at most 1, got {self.fusion_shrinkage}")
+        if self.split_forms and self.coordinates != "fused":
+            raise ValueError(f"policy.split_forms is for policy.coordinates=fused; got true and {self.coordinates}")
         if self.fourier_features < 0 or (self.fourier_features and self.coordinates != "fused"):
             raise ValueError(
                 "policy.fourier_features must be 0 (none) or more, and is for policy.coordinates=fused; "
@@ -308,6 +319,8 @@ class HDRILConfig(SingleFrameConfig):
                     "the checkpoint has policy.coordinates=fused of a version that fused its maps in another way: "
                     "train it anew, or run it with the version that saved it"
                 )
+        if self.primitives and not self.forms:
+            self.forms = [[k] for k in range(len(self.primitives))]
         if self.primitive_lengths and not self.capacity:
             self.capacity = max(longest for _, longest in self.primitive_lengths)
         if self.primitive_lengths and not self.training_data:
@@ -324,6 +337,17 @@ class HDRILConfig(SingleFrameConfig):
                 raise ValueError(
                     f"policy.preset={self.preset} makes policy.{name} {value!r}, but {given!r} was given; leave out one"
                 )
+
+    @property
+    def halved(self) -> list[int]:
+        """Columns of an action that tell forms of a primitive apart: those that are no pose's."""
+        posed = {column for group in pose_groups(self.action_names) for column in group}
+        return [i for i in range(len(self.action_names)) if i not in posed] if self.split_forms else []
+
+    @property
+    def form_names(self) -> list[str]:
+        """The primitive of each form."""
+        return [self.primitives[form[0]] for form in self.forms]
 
     @property
     def filters(self) -> list[int]:

@@ -22,6 +22,7 @@ import torch
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
 
+from lerobot_policy_hdril.forms import assign, find_forms, halves
 from lerobot_policy_hdril.schema import LANGUAGE, LANGUAGE_STYLE, SUBTASK_KEY, SUBTASK_START, SUBTASKS_PATH
 
 if TYPE_CHECKING:
@@ -185,13 +186,21 @@ class Demonstrations:
         subtask_key: column that labels each frame with its primitive.
         device: where the tensors are.
         filters: lengths of the W means of the last states that are beside each state, frames.
+        halved: columns of the action that tell the forms of a primitive apart; none: each has one form.
+        forms: those of a checkpoint; empty for those of the dataset.
 
     Raises:
         ValueError: labels that are not integers from 0 to the number of primitives - 1, or a primitive with no frames.
     """
 
     def __init__(
-        self, metadata: LeRobotDatasetMetadata, subtask_key: str, device: str, filters: Sequence[int] = ()
+        self,
+        metadata: LeRobotDatasetMetadata,
+        subtask_key: str,
+        device: str,
+        filters: Sequence[int] = (),
+        halved: Sequence[int] = (),
+        forms: Sequence[Sequence[int]] = (),
     ) -> None:
         root = Path(metadata.root)
         columns, self.primitives = _read_columns(root, subtask_key)
@@ -201,6 +210,12 @@ class Demonstrations:
         new_segment = new_episode | (np.diff(columns["label"], prepend=-1) != 0)
         if "start" in columns:
             new_segment |= columns["start"]
+        begins = np.flatnonzero(new_segment)
+        named, grips = columns["label"][begins], columns["action"][:, list(halved)]
+        half = halves(grips[begins], grips)
+        self.forms = [tuple(form) for form in forms] or find_forms(named, half, len(self.primitives))
+        """What the labels are of."""
+        columns["label"] = np.repeat(assign(named, half, self.forms), np.diff([*begins, len(new_segment)]))
         self.episode_index: list[int] = columns["episode_index"][new_episode].tolist()
         """What the dataset calls each episode."""
         self.index, self.state, self.action, self.label, self.episode, self.segment = (
@@ -247,14 +262,14 @@ class Demonstrations:
         """Shortest and longest run of each primitive in these episodes, frames; [0, 0] for one that is not among them."""
         bounds = self._segment_bounds[episodes[self.episode[self._segment_bounds[:, 0]]]]
         lengths, labels = bounds[:, 1] - bounds[:, 0], self.label[bounds[:, 0]]
-        runs = [lengths[labels == k] for k in range(len(self.primitives))]
+        runs = [lengths[labels == k] for k in range(len(self.forms))]
         return [[int(run.min()), int(run.max())] if len(run) else [0, 0] for run in runs]
 
     def beginnings(self, episodes: Tensor) -> Tensor:
         """How often each primitive begins after each, and first of all (K + 1, K), in these episodes."""
         first = self._segment_bounds[episodes[self.episode[self._segment_bounds[:, 0]]], 0]
         fresh = first == self._episode_bounds[self.episode[first], 0]
-        count = len(self.primitives)
+        count = len(self.forms)
         before = torch.where(fresh, count, self.label[(first - 1).clamp_min(0)])
         return (before * count + self.label[first]).bincount(minlength=(count + 1) * count).unflatten(0, (-1, count))
 
@@ -300,6 +315,6 @@ class Demonstrations:
         since = self._segment_bounds[self.segment[steps], 0]
         begins, before = steps == since, (steps - 1).clamp_min(0)
         fresh = steps == first[:, None]
-        playing = torch.where(fresh, len(self.primitives), self.label[before])
+        playing = torch.where(fresh, len(self.forms), self.label[before])
         elapsed = torch.where(fresh, 0, steps - self._segment_bounds[self.segment[before], 0])
         return History(self.state[steps], self.label[steps], begins, playing, elapsed, mask)

@@ -59,7 +59,7 @@ def attend(policy: HDRILPolicy, playback: PlaybackState) -> Attention:
     rows = [policy.model_of(k).graph.attention(given[i : i + 1], seen[i : i + 1]) for i, k in enumerate(playing)]
     return Attention(
         nodes=list(policy.planner.graph.node_names),
-        primitives=[policy.config.primitives[k] for k in playing],
+        primitives=[policy.config.form_names[k] for k in playing],
         planner=policy.planner.attention(policy.normalise(seen), seen),
         dynamics=torch.cat(rows),
     )
@@ -67,15 +67,18 @@ def attend(policy: HDRILPolicy, playback: PlaybackState) -> Attention:
 
 def explain(policy: HDRILPolicy, playback: PlaybackState, row: int) -> Explanation:
     """Plain values of one row of the batch."""
-    names, attention = policy.config.primitives, attend(policy, playback.select(row))
+    names, attention = policy.config.form_names, attend(policy, playback.select(row))
     received = attention.received(planner=policy.config.decoder == "linear")
     plan = None
     if playback.replanned[row]:
         rest = playback.select(row).rest(policy.longest_length)
         plan = rest[0, :, : len(policy.config.action_names)].numpy(force=True).copy()
+    probabilities = dict.fromkeys(policy.config.primitives, 0.0)
+    for name, value in zip(names, playback.probabilities[row].tolist(), strict=True):
+        probabilities[name] += value
     return Explanation(
         primitive=names[int(playback.primitive[row])],
-        probabilities=dict(zip(names, playback.probabilities[row].tolist(), strict=True)),
+        probabilities=probabilities,
         plan=plan,
         attention={name: float(share[0]) for name, share in received.items()},
         events=_events(names, playback, row),
@@ -85,5 +88,6 @@ def explain(policy: HDRILPolicy, playback: PlaybackState, row: int) -> Explanati
 def _events(names: list[str], playback: PlaybackState, row: int) -> tuple[str, ...]:
     """A primitive that begins for the second time or later."""
     playing = int(playback.primitive[row])
-    again = int(playback.elapsed[row]) == 0 and int(playback.begun[row, playing]) > 1
+    alike = torch.tensor([name == names[playing] for name in names])
+    again = int(playback.elapsed[row]) == 0 and int(playback.begun[row, alike].sum()) > 1
     return (f"{names[playing]} tried again",) if again else ()

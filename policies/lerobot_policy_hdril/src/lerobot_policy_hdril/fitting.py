@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_policy_hdril.demonstrations import Demonstrations, Window
+from lerobot_policy_hdril.forms import FEWEST
 from lerobot_policy_hdril.fusion import RIDGES, FusedMaps
 from lerobot_policy_hdril.provenance import Origin, TrainingData, from_runs
 
@@ -119,8 +120,16 @@ def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Te
     if frames.fourier is not None:
         frames.fourier.fit(states, config.min_std)
     rows = demonstrations.replan_rows(policy.ahead, episodes)
-    for k in range(len(maps)):
-        window = _window(demonstrations, rows[demonstrations.label[rows] == k], policy.ahead, policy.ahead)
+    executions = demonstrations.beginnings(episodes).sum(0)
+    for k, form in enumerate(demonstrations.forms):
+        # What is seldom shown is done as the primitive is done in general.
+        alike = (
+            [i for i, other in enumerate(demonstrations.forms) if other[0] == form[0]]
+            if executions[k] < FEWEST
+            else [k]
+        )
+        mine = torch.isin(demonstrations.label[rows], torch.tensor(alike, device=rows.device))
+        window = _window(demonstrations, rows[mine], policy.ahead, policy.ahead)
         features = policy.features(window.seen)[0]
         cast(FusedMaps, maps[k]).fit(
             features,

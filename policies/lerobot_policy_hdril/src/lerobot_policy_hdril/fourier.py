@@ -13,7 +13,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from lerobot_policy_hdril.coordinates import positive
+from lerobot_policy_hdril.coordinates import positive, unit
 
 REACH = 0.1
 """Distance, m, over which a goal may bend: the length scale of the kernel. What observations are off by is far less."""
@@ -24,12 +24,13 @@ SPREAD = 2.0
 
 
 class FourierFeatures(nn.Module):
-    """Features of each object: of its pose z in the world, and of the objects' numbers that are no pose's,
+    """Features i = 1 ... n of each object: of z, which is its pose in the world and all objects' numbers that are no pose's,
 
-        sqrt(2) cos(w_i z + b_i)        w_i ~ N(0, 1), b_i uniform in a turn
+        8 / sqrt(n) cos(w_i z + b_i)        w_i ~ N(0, 1), b_i uniform in a turn
 
-    so that the mean over i of the products of two states' features is about exp(-|z - z'|^2 / 2), and a ridge regression on them
-    about a Gaussian process. Lengths are in :data:`REACH`, :data:`TURN` and :data:`SPREAD`.
+    so that the sum over i of the products of two states' features is about 32 exp(-|z - z'|^2 / 2), whatever n, and a ridge
+    regression on them is about a Gaussian process. With n = 32 a feature varies as much as one that is normalised. Lengths are
+    in :data:`REACH`, :data:`TURN` and :data:`SPREAD`.
 
     The w and b are drawn from a fixed seed, and part of the checkpoint.
 
@@ -68,8 +69,10 @@ class FourierFeatures(nn.Module):
 
     def forward(self, state: Tensor) -> Tensor:
         """The features (B, F count) of states (B, S)."""
-        poses = positive(state[:, self.poses])  # (B, F, 7)
+        poses = state[:, self.poses]  # (B, F, 7); a mean's quaternion is no unit one
+        poses = positive(torch.cat([poses[..., :3], unit(poses[..., 3:])], dim=-1))
         numbers = state[:, None, self.numbers].expand(-1, len(self.poses), -1)
         inputs = (torch.cat([poses, numbers], dim=-1) - self.middle) / self.scale
-        angle = torch.einsum("bfi,fic->bfc", inputs, self.frequency.to(inputs)) + self.phase
-        return (math.sqrt(2.0) * torch.cos(angle)).flatten(1)
+        # No matrix product: in mixed precision that would be coarser than the features may be.
+        angle = (inputs[..., None] * self.frequency).sum(-2) + self.phase
+        return (8.0 / math.sqrt(self.phase.shape[1]) * torch.cos(angle)).flatten(1)

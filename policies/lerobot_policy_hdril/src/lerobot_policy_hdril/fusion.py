@@ -36,6 +36,8 @@ BENDS = 1.03
 """A map bends with where its frame's object stands (:class:`~lerobot_policy_hdril.fourier.FourierFeatures`) unless its mean
 squared leave-one-out error is then more than so many times as large, as it is where there are few demonstrations. To ask for a
 smaller one would be too much: where a hand goes in the next frames hangs on where it is, and little on where it will end."""
+SHUT_OUT = 1e9
+"""Penalty on features that a map is not to see at all."""
 MOVED = 0.03
 """Distance from its longest mean, m, at which an object counts as just moved, in the median of the demonstrations. It goes with a
 mean of 24 frames at 10 frames a second; without a mean, nothing counts as moved."""
@@ -169,16 +171,20 @@ class ObjectFrames(nn.Module):
         return (places[:, 0] - places[:, -1]).norm(dim=-1).median(0).values >= MOVED
 
     def penalties(self, moved: Tensor, seen: float, still: float, other: float, bend: bool = False) -> Tensor:
-        """The penalty of each frame's map on each feature (1 + V F, W), the Fourier features last: one of the three.
+        """The penalty of each frame's map on each feature (1 + V F, W), the Fourier features last: one of the three, or
+        :data:`SHUT_OUT`.
 
         ``seen`` for the hands as they are now and what has moved, as they are seen from the frame; for the means of the hands
         too, if something has moved, because they tell how it is held; and for what is no pose in the present state, such as an
         opening or a size, of the hands, of what has moved, of the frame's own object and of what has no pose at all. ``still``
-        for what stands still, as seen from the frame, and for where the hands are in the world. ``other`` for all else.
+        for what stands still, as seen from the frame, and for where the hands are in the world. ``other`` for all else. A map
+        that bends sees the Fourier features of the frame's own object for ``still``, unless that has moved; all other Fourier
+        features are shut out.
 
         Args:
             moved: which objects have (F,).
             seen, still, other: the penalties.
+            bend: whether the maps bend.
         """
         frames = torch.arange(self.count, device=moved.device)[:, None]
         objects, views = (frames - 1) % len(self.objects), (frames - 1).div(len(self.objects), rounding_mode="floor")
@@ -195,7 +201,7 @@ class ObjectFrames(nn.Module):
         if self.fourier is None:
             return penalty
         bends = (self.fourier.owner == objects) & ~moved[self.fourier.owner]
-        return torch.cat([penalty, torch.where(bends & bend, still, other).to(penalty)], dim=-1)
+        return torch.cat([penalty, torch.where(bends & bend, still, SHUT_OUT).to(penalty)], dim=-1)
 
 
 class FusedMaps(nn.Module):

@@ -85,7 +85,10 @@ class HDRILPolicy(PreTrainedPolicy):
         self._begin_weights: Tensor | None = None
         if dataset_meta is not None:
             config.set_dataset_feature_metadata(dataset_meta.features)
-            data = Demonstrations(dataset_meta, config.subtask_key, config.device or "cpu", config.filters)
+            data = Demonstrations(
+                dataset_meta, config.subtask_key, config.device or "cpu", config.filters, config.halved, config.forms
+            )
+            config.forms = [list(form) for form in data.forms]
             config.learn_primitives(data.primitives, data.longest)
             config.learn_replanning()
             self._demonstrations = data
@@ -103,14 +106,15 @@ class HDRILPolicy(PreTrainedPolicy):
         state_dim, action_dim = len(names), len(config.action_names)
         config.check_replanning()
         self.capacity = config.capacity
-        models = len(config.primitives) if config.per_primitive else 1
+        kinds = len(config.forms)
+        models = kinds if config.per_primitive else 1
         fused = config.coordinates == "fused"
         self.ahead = config.trained_replan_every if fused and config.trained_replan_every > 0 else self.capacity
         self.dynamics = nn.ModuleList(
             PrimitiveDynamics(
                 names,
                 skip_columns=list(range(len(config.state_names), state_dim)) if config.skip else [],
-                context_dim=0 if config.per_primitive else len(config.primitives),
+                context_dim=0 if config.per_primitive else kinds,
                 out_dim=action_dim + state_dim,
                 steps=self.capacity,
                 interaction=config.interaction,
@@ -127,7 +131,7 @@ class HDRILPolicy(PreTrainedPolicy):
         )
         self.planner = Planner(
             names,
-            len(config.primitives),
+            kinds,
             config.interaction,
             config.planner_hidden_dim,
             config.node_dim,
@@ -148,14 +152,14 @@ class HDRILPolicy(PreTrainedPolicy):
                 names, config.environment_names, config.action_names, views, config.fourier_features
             )
             starts = -(-self.capacity // self.ahead)
-            self.fused = nn.ModuleList(FusedMaps(frames, starts, self.ahead) for _ in config.primitives)
+            self.fused = nn.ModuleList(FusedMaps(frames, starts, self.ahead) for _ in config.forms)
             self.register_buffer("feature_mean", torch.zeros(frames.dim))
             self.register_buffer("feature_std", torch.ones(frames.dim))
         for key, size in (("state", state_dim), ("output", action_dim + state_dim)):
             self.register_buffer(f"{key}_mean", torch.zeros(size))
             self.register_buffer(f"{key}_std", torch.ones(size))
         for key in ("shortest_length", "longest_length"):
-            self.register_buffer(key, torch.zeros(len(config.primitives), dtype=torch.long), persistent=False)
+            self.register_buffer(key, torch.zeros(kinds, dtype=torch.long), persistent=False)
         if config.primitive_lengths:
             self.set_lengths(config.primitive_lengths)
         self._quaternions = torch.tensor(quaternion_groups(config.action_names), dtype=torch.long)
@@ -311,13 +315,13 @@ class HDRILPolicy(PreTrainedPolicy):
     def planner_loss(
         self, history: History, window: Window, generator: torch.Generator | None = None
     ) -> tuple[Tensor, float]:
-        """Cross-entropy over all frames of the episodes, in which rare beginnings count more (``planner_balance``), and the share
-        of frames at which the most probable answer is the right one; plus cross-entropy over the frames at which windows start,
-        each seen without what was before it. That is all that :meth:`predict_action_chunk` has where no episode runs.
-        ``generator`` draws what the planner leaves out."""
+        """Cross-entropy over all frames of the episodes, in which rare beginnings count more in training (``planner_balance``),
+        and the share of frames at which the most probable answer is the right one; plus cross-entropy over the frames at which
+        windows start, each seen without what was before it. That is all that :meth:`predict_action_chunk` has where no episode
+        runs. ``generator`` draws what the planner leaves out."""
         told = (history.playing, history.elapsed) if self.planner.steps else (None, None)
         nothing = torch.zeros_like(window.primitive)[:, None]
-        alone_told = (nothing + len(self.config.primitives), nothing) if self.planner.steps else (None, None)
+        alone_told = (nothing + len(self.config.forms), nothing) if self.planner.steps else (None, None)
         logits, _ = self.planner(self.normalise(history.state), history.state, None, *told, generator)
         alone, _ = self.planner(
             self.normalise(window.state)[:, None], window.state[:, None], None, *alone_told, generator
@@ -326,7 +330,7 @@ class HDRILPolicy(PreTrainedPolicy):
         if self.planner.steps:  # 0 is that the primitive goes on
             right, first = torch.where(history.begins, right + 1, 0), first + 1
         each = F.cross_entropy(logits[history.mask], right[history.mask], reduction="none")
-        if self._begin_weights is not None:
+        if self.training and self._begin_weights is not None:
             weights = self._begin_weights[history.playing, history.primitive].where(history.begins, 1.0)
             each = each * weights[history.mask]
         loss = each.mean() + F.cross_entropy(alone[:, 0], first)
@@ -392,11 +396,11 @@ class HDRILPolicy(PreTrainedPolicy):
         linear = self.linear_input(seen) if self.fused is None else normalised  # which nothing reads then
         steps = self.steps(elapsed)
         if not self.config.per_primitive:
-            context = F.one_hot(primitive, len(self.config.primitives)).to(state.dtype)
+            context = F.one_hot(primitive, len(self.config.forms)).to(state.dtype)
             return self.model_of(0)(normalised, state, context, steps, linear, samples)
         if self._stacks(primitive):
             context = state.new_zeros(len(state), 0)
-            models = [self.model_of(k) for k in range(len(self.config.primitives))]
+            models = [self.model_of(k) for k in range(len(self.config.forms))]
             return predict_stacked(models, normalised, state, context, steps, linear, primitive, samples)
         result = torch.empty(len(state), self.ahead, len(self.loss_weights), device=state.device, dtype=state.dtype)
         divergence, context = state.new_zeros(len(state)), state.new_zeros(len(state), 0)
@@ -485,7 +489,7 @@ class HDRILPolicy(PreTrainedPolicy):
         told: tuple[Tensor, ...] = ()
         if self.planner.steps:
             nothing = torch.zeros(len(state), dtype=torch.long, device=state.device)
-            playing = nothing + len(self.config.primitives) if previous is None else previous.primitive
+            playing = nothing + len(self.config.forms) if previous is None else previous.primitive
             elapsed = nothing if previous is None else previous.elapsed + 1
             told = playing[:, None], elapsed[:, None]
         memory = None if previous is None else previous.memory

@@ -8,7 +8,7 @@ from lerobot.configs.policies import PreTrainedConfig
 
 from lerobot_policy_hdril.configuration_hdril import HDRILConfig
 
-# What further training reads. The fit of a checkpoint is not made anew: ridges, shrinkage and min_std are fixed.
+# What further training reads. The fit of a checkpoint is not made anew: what decides it is fixed.
 _TRAINING = {
     "kl_weight",
     "state_loss_weight",
