@@ -32,7 +32,8 @@ def damage(checkpoint: Path, output: Path, primitive: str) -> None:
     if output.exists():
         raise FileExistsError(f"{output} exists; choose another folder or delete it")
     weights = load_file(checkpoint / "model.safetensors")
-    mine = tuple(f"{part}.{own.index(primitive)}." for part in ("dynamics", "fused"))
+    forms = [k for k, name in enumerate(config.form_names) if name == primitive]
+    mine = tuple(f"{part}.{k}." for part in ("dynamics", "fused") for k in forms)
     for name, value in weights.items():
         # Predictions without precision could not be fused.
         if name.startswith(mine) and not name.endswith((".whitening", ".agreement", ".variance")):

@@ -24,7 +24,7 @@ from hdril.benchmark.matrix import Matrix, all_steps, rows, steps
 from hdril.benchmark.page import write_report
 from hdril.benchmark.report import markdown
 from hdril.benchmark.results import collect
-from hdril.benchmark.steps import Calibrate, Evaluate, Play, Step
+from hdril.benchmark.steps import Calibrate, Evaluate, Play, Record, Step
 from hdril.benchmark.store import Store
 from hdril.cli.benchmark import BenchmarkConfig, benchmark_command
 from hdril.demonstrations.read import read_episode
@@ -114,6 +114,7 @@ def test_what_decides_a_result_is_in_its_settings_and_nothing_else(tmp_path: Pat
     assert not same(evaluate, options=("--policy.rollout=open_loop",))
     assert not same(record, perturb=0.001)
     assert not same(record, stray=0.001)
+    assert "--stray=0.03" in Record("table_lift", 3, stray=0.03).command(tmp_path, {})
     assert not same(record, task="table_lift:push=1")
     config = tmp_path / "train.yaml"
     config.write_text(train.config.read_text())
@@ -147,6 +148,7 @@ def test_a_change_of_hdril_does_not_touch_what_it_does_not_make(monkeypatch: pyt
         (lambda v: v["tables"][0].update(demonstrations=[50, 50]), "demonstrations has 50 twice"),
         (lambda v: v["tables"][0].update(policies=["hdril", "hdril"]), "policies has 'hdril' twice"),
         (lambda v: v["data"]["nominal"].update(perturb=-0.1), "data nominal: perturb must be from 0 to 0.03 m, got -0.1"),
+        (lambda v: v["data"]["nominal"].update(stray=0.2), "data nominal: stray must be from 0 to 0.1 m, got 0.2"),
         (lambda v: v.update(name="two words"), "name must be of letters, digits, .* got 'two words'"),
         (lambda v: v["policies"]["act"].update(steps=0), "policy act: give steps, at least 1, or else minutes; got 0 steps"),
         (lambda v: v["policies"]["act"].update(steps=-1, minutes=[5]), "policy act: give steps, at least 1, or else minutes"),
@@ -816,6 +818,7 @@ def test_a_report_grows_table_by_table(tmp_path: Path) -> None:
     [
         lambda values: values["policies"]["act"].update(steps=31),
         lambda values: values["data"]["nominal"].update(perturb=0.001),
+        lambda values: values["data"]["nominal"].update(stray=0.001),
         lambda values: values["evaluations"]["nominal"].update(options=["--max_frames=80"]),
         lambda values: values["tables"][1].update(training_seeds=[1]),
     ],

@@ -80,6 +80,17 @@ def test_now_and_then_a_hand_strays() -> None:
     assert np.concatenate(places).std(axis=0) == pytest.approx(np.full(3, 0.03), rel=0.15)
 
 
+def test_an_episode_does_not_hang_on_what_was_before_it() -> None:
+    actor = PerturbedActor(Still(1.0), 0.0, 0.03)
+    for frames in range(60):  # the last episode may end while a hand strays
+        actor.reset(0)
+        for _ in range(frames):
+            actor.act(OBSERVATION)
+        actor.reset(9)
+        sent = np.stack([actor.act(OBSERVATION).sent for _ in range(20)])
+        np.testing.assert_array_equal(hand_poses(sent)[..., :3], offsets(1.0, 0.0, seed=9, stray=0.03, frames=20))
+
+
 def test_strays_join_the_noise_of_every_frame() -> None:
     noise, both = offsets(1.0, 0.01, frames=200), offsets(1.0, 0.01, stray=0.03, frames=200)
     np.testing.assert_allclose(both - noise, offsets(1.0, 0.0, stray=0.03, frames=200), atol=1e-12)
@@ -98,6 +109,17 @@ def test_hands_that_may_hold_one_body_stray_alike() -> None:
 def test_a_deviation_out_of_range_is_refused(name: str, deviation: float, most: float) -> None:
     with pytest.raises(ValueError, match=rf"^{name} must be from 0 to {most} m, got {deviation}$"):
         Recipe("table_lift", **{name: deviation})
+
+
+def test_a_recipe_of_strays_alone_disturbs_the_robot() -> None:
+    recipe = Recipe("table_lift", stray=0.05)
+    assert recipe.perturbed
+    env, expert = recipe.make_env(), recipe.make_expert()
+    with closing(env):
+        decisions = [transition.decision for transition in transitions(env, expert, 11)]
+    apart = [np.abs(d.sent - d.action).max() if d.sent is not None else 0.0 for d in decisions]
+    assert max(apart) > 0.02
+    assert min(apart) == 0.0
 
 
 @pytest.mark.parametrize("noise", [{"perturb": 0.005}, {"perturb": 0.005, "stray": 0.02}])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,12 @@ from hdril.demonstrations.provenance import RECIPE_PATH, Provenance, Recipe, rea
 from hdril.simulation.world import Physics
 from hdril.tasks.primitives import Noise
 
-MADE = Provenance(Recipe("table_lift", Noise(0.002), Physics(substeps=30)), (7, 9), {8: "table upright"}, "0.0.9")
+MADE = Provenance(
+    Recipe("table_lift", Noise(0.002), Physics(substeps=30), perturb=0.004, stray=0.02),
+    (7, 9),
+    {8: "table upright"},
+    "0.0.9",
+)
 
 
 @pytest.fixture
@@ -40,6 +46,16 @@ def test_a_whole_number_may_stand_for_a_float(root: Path) -> None:
     assert read.recipe.noise == Noise(0.0)
 
 
+def test_a_dataset_of_before_was_recorded_without_what_came_later(root: Path) -> None:
+    path = root / RECIPE_PATH
+    values = json.loads(path.read_text())
+    del values["recipe"]["perturb"], values["recipe"]["stray"]
+    path.write_text(json.dumps(values))
+    read = read_provenance(root)
+    assert read is not None
+    assert read.recipe == replace(MADE.recipe, perturb=0.0, stray=0.0)
+
+
 def test_a_dataset_of_others_has_none(tmp_path: Path) -> None:
     assert read_provenance(tmp_path) is None
 
@@ -64,6 +80,8 @@ CHANGES: dict[str, Change] = {
     "recipe.physics.substeps must be of type int, got 2.5": (
         lambda values: values["recipe"]["physics"].update(substeps=2.5)
     ),
+    "recipe.perturb must be of type float, got 'some'": lambda values: values["recipe"].update(perturb="some"),
+    "recipe.stray must be of type float, got 'far'": lambda values: values["recipe"].update(stray="far"),
     "recipe.task must be of type str, got 3": lambda values: values["recipe"].update(task=3),
     "unknown task 'chess'; choose from: ": lambda values: values["recipe"].update(task="chess"),
     "unknown robot 'dog'; choose from: ": lambda values: values["recipe"].update(robot="dog"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +118,23 @@ def test_a_form_that_few_episodes_show_moves_as_the_primitive_does_in_general(gr
         policy.forward({"index": torch.tensor([FRAMES * episode for episode in episodes])})
         assert torch.equal(policy.fused[0].weight, policy.fused[1].weight) == shared
     assert data.beginnings(torch.ones(6, dtype=torch.bool)).sum(0).tolist() == [6] * 7
+
+
+def test_damage_on_purpose_is_done_to_all_forms(gripping, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``scripts/damage.py``"""
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "scripts")
+    policy = make(gripping)
+    policy.save_pretrained(tmp_path / "whole")
+    import_module("damage").damage(tmp_path / "whole", tmp_path / "damaged", policy.config.primitives[0])
+    damaged = load(tmp_path / "damaged")
+    assert [bool((maps.weight == 0.0).all()) for maps in damaged.fused] == [True, True, *[False] * 5]
+
+
+def test_the_card_tells_forms_apart(gripping) -> None:
+    card = str(make(gripping).generate_model_card("user/data", "hdril", None, None))
+    first = demonstrations(make(gripping)).primitives[0]
+    for upper in ("no number", "left_gripper.pos"):
+        assert re.search(rf"\| {first} \(begins with {upper} in the upper half\) +\| 5 +\|", card)
 
 
 def test_without_the_option_each_primitive_has_one_form(gripping, metadata) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pytest
 import torch
+from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot_policy_hdril import HDRILConfig
 from lerobot_policy_hdril.dynamics import solve_ridge
 from lerobot_policy_hdril.fourier import REACH, SPREAD, TURN, FourierFeatures
@@ -16,7 +19,7 @@ from torch.nn import functional as F
 
 from tests.policies.test_checkpoint import load, without
 from tests.policies.test_reactive import ACTION, CUP, SHELF, SHRINKAGE, STATE, at_cup, generator, scenes
-from tests.policies.tools import build, observation
+from tests.policies.tools import FRAMES, build, edit, observation, read
 
 OBJECTS = [*CUP, *SHELF, "cup.size"]
 SIZE = STATE.index("cup.size")
@@ -198,6 +201,37 @@ def test_a_policy_sees_them_where_objects_rest(metadata) -> None:
     other = seen.clone()
     other[:, :2] += 0.1
     torch.testing.assert_close(policy.features(other)[0][:, policy.frames.dim :], added)
+
+
+def sized(copy: Path) -> LeRobotDatasetMetadata:
+    """The dataset with a size beside the table's pose: 0.1 m larger in each episode, and far larger in the last one."""
+    name = "observation.environment_state"
+    info = json.loads((copy / "meta/info.json").read_text())
+    feature = info["features"][name]
+    feature["names"] = [*feature["names"], "table.size"]
+    feature["shape"] = [len(feature["names"])]
+    longer = pa.list_(pa.float32(), len(feature["names"]))
+    edit(copy, name, lambda episode, frame, value: [*value, (0.1 * episode if episode < 5 else 9.0)], longer)
+    (copy / "meta/info.json").write_text(json.dumps(info))
+    return read(copy)
+
+
+def test_the_scale_of_a_size_is_of_what_was_learned_from_and_in_the_checkpoint(copy: Path, tmp_path: Path) -> None:
+    data = sized(copy)
+    policy = build(data, learned=False, preset="hdril_reactive", hidden_dim=32)
+    policy.forward({"index": FRAMES * torch.arange(5)})
+    assert policy.frames is not None
+    made = policy.frames.fourier
+    assert made is not None
+    assert float(made.scale[7]) == pytest.approx(SPREAD * 0.1 * 2.0**0.5, rel=1e-4)  # of 0 to 4
+    assert float(made.middle[7]) == pytest.approx(0.2, rel=1e-4)
+    with torch.no_grad():
+        made.frequency.mul_(1.5)
+        made.phase.add_(0.2)
+    policy.save_pretrained(tmp_path / "saved")
+    again = load(tmp_path / "saved").frames
+    states = torch.rand(5, len(policy.config.state_names) + 8, generator=generator(4))
+    assert torch.equal(again.fourier(states), made(states))
 
 
 def test_checkpoint_from_before_them_has_none(metadata, tmp_path: Path) -> None:

@@ -193,7 +193,7 @@ def test_rare_beginnings_count_more_and_no_more_than_ten_times() -> None:
 
 def test_the_loss_of_a_beginning_is_weighted_and_that_of_all_else_is_not(mended) -> None:
     plain, policy = (
-        build(mended, preset="hdril_reactive", hidden_dim=32, planner_balance=balance).eval() for balance in (0.0, 1.0)
+        build(mended, preset="hdril_reactive", hidden_dim=32, planner_balance=balance) for balance in (0.0, 1.0)
     )
     assert_same(tensors(plain), tensors(policy))
     data, rows = demonstrations(policy), torch.tensor([2 * FRAMES, 4 * FRAMES])
@@ -205,6 +205,27 @@ def test_the_loss_of_a_beginning_is_weighted_and_that_of_all_else_is_not(mended)
     more[:, 62], more[1, 66] = 6 / 2 - 1, 6 / 1 - 1  # six episodes begin as usual, two thus, and one again
     difference = policy.planner_loss(history, window)[0] - plain.planner_loss(history, window)[0]
     torch.testing.assert_close(difference, (each * more[history.mask]).mean())
+
+
+def test_beginnings_of_episodes_that_are_not_learned_from_do_not_count(mended) -> None:
+    policy = build(mended, learned=False, preset="hdril_reactive", hidden_dim=32, planner_balance=0.5)
+    data, learned = demonstrations(policy), torch.zeros(6, dtype=torch.bool)
+    for episodes in ([0, 1, 4], [2]):
+        learned[episodes] = True
+        policy.forward({"index": FRAMES * torch.tensor(episodes)})
+        told = policy._begin_weights
+        assert told is not None
+        assert torch.equal(told, begin_weights(data.beginnings(learned), 0.5))
+        assert not torch.equal(told, begin_weights(data.beginnings(torch.ones(6, dtype=torch.bool)), 0.5))
+
+
+def test_held_out_losses_are_not_weighted(mended) -> None:
+    plain, policy = (
+        build(mended, preset="hdril_reactive", hidden_dim=32, planner_balance=balance).eval() for balance in (0.0, 1.0)
+    )
+    with torch.no_grad():
+        losses = [p.forward({"index": BATCH})[1]["planner_loss"] for p in (plain, policy)]
+    assert losses[0] == losses[1]
 
 
 def test_a_resumed_policy_weighs_beginnings_as_before(mended, tmp_path: Path) -> None:

@@ -79,14 +79,14 @@ def _observations(files: tuple[tuple[str, int], ...]) -> dict[str, torch.Tensor]
     }
 
 
-def edit(root: Path, key: str, change: Callable[[int, int, Any], Any]) -> None:
-    """Rewrite a column: ``change(episode, frame, value)`` gives the new value."""
+def edit(root: Path, key: str, change: Callable[[int, int, Any], Any], kind: pa.DataType | None = None) -> None:
+    """Rewrite a column: ``change(episode, frame, value)`` gives the new value, of the same type unless another is given."""
     for file in (root / "data").glob("*/*.parquet"):
         table = pq.read_table(file)
         columns = (table[name].to_pylist() for name in ("episode_index", "frame_index", key))
         values = [change(*row) for row in zip(*columns, strict=True)]
         at = table.column_names.index(key)
-        pq.write_table(table.set_column(at, key, pa.array(values, table[key].type)), file)
+        pq.write_table(table.set_column(at, key, pa.array(values, kind or table[key].type)), file)
 
 
 def vary_lengths(root: Path) -> Path:

@@ -165,10 +165,13 @@ def test_episode_of_a_dataset_is_played_again_with_its_labels(dataset: Path, tmp
     assert states(text, "/primitive/scripted") == {"grasp", "move", "lift", "extend", "place", "retract"}
 
 
-def test_episode_of_a_disturbed_robot_is_played_again_with_its_event(tmp_path: Path, capsys) -> None:
+@pytest.mark.parametrize("noise", [{"perturb": 0.003}, {"stray": 0.01}])
+def test_episode_of_a_disturbed_robot_is_played_again_with_its_event(
+    noise: dict[str, float], tmp_path: Path, capsys
+) -> None:
     """The recorded actions are not what the robot was told, and the table was pushed."""
     task = "table_lift:push=1"
-    provenance = record(Recipe(task, perturb=0.003), 1, 930_000, tmp_path / "dataset")
+    provenance = record(Recipe(task, **noise), 1, 930_000, tmp_path / "dataset")
     view_command(ViewConfig(dataset=tmp_path / "dataset", save=tmp_path / "episode.rrd"))
     (seed,) = provenance.seeds
     assert f"seed {seed}, played again: its states are 0 m or less from the recorded ones" in capsys.readouterr().out
