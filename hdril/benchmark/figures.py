@@ -134,8 +134,8 @@ def _success(table: Mapping[str, Any]) -> Figure:
             y = place + (number - (len(names) - 1) / 2) * 0.8 / len(names)
             _mark(axes, row["cells"][name], y, number, name if place == 0 else None)
     axes.set_yticks(range(len(rows)), labels)
-    axes.invert_yaxis()
-    axes.set(xlim=(-2, 102), xlabel="success, %", title=table["title"])
+    # The first row on top, and room beside the outermost marks, also where there is one row.
+    axes.set(xlim=(-2, 102), ylim=(len(rows) - 0.5, -0.5), xlabel="success, %", title=table["title"])
     axes.grid(axis="x", alpha=0.3)
     axes.legend(loc="lower left", bbox_to_anchor=(1.0, 0.0), frameon=False)
     return figure
