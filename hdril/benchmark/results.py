@@ -34,6 +34,9 @@ _KEPT = ("n_episodes", "n_success", "pc_success", "pc_success_ci95", "held_out",
 _SHAPE = 3
 """Of a table as data. It counts up when the report needs what older tables do not have: they are not kept then."""
 
+_LATER = {"stray": 0.0}
+"""Options that came later than reports which are kept. A definition that does not use them asks for what it asked for before."""
+
 
 def collect(matrix: Matrix, store: Store) -> dict[str, Any]:
     """The numbers of all tables, all of whose steps are done.
@@ -75,7 +78,7 @@ def _asked(matrix: Matrix, table: TableSpec) -> str:
         for spec in (matrix.policies[name] for name in table.policies)
     ]
     data, evaluations = (
-        [asdict(known[name]) for name in names]
+        [{key: value for key, value in asdict(known[name]).items() if _LATER.get(key) != value} for name in names]
         for names, known in ((table.data, matrix.data), (table.evaluations, matrix.evaluations))
     )
     return digest_json([_SHAPE, asdict(wordless), data, policies, evaluations])[:SHORT]

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from lerobot.configs.train import TrainPipelineConfig
 
+from hdril.benchmark import results
 from hdril.benchmark.calibrate import Speed
 from hdril.benchmark.check import check, check_held_out
 from hdril.benchmark.engine import in_order
@@ -810,6 +811,20 @@ def test_a_report_grows_table_by_table(tmp_path: Path) -> None:
     assert do(tmp_path, "Lift", "two", word)["tables"][1]["note"] == "A better note."
     with pytest.raises(ValueError, match=r"^only has no table 'Peg'; choose from: 'Lift', 'Again, nominal'$"):
         do(tmp_path, "Peg", "two")
+
+
+@pytest.mark.usefixtures("nothing_is_done")
+def test_a_report_of_before_an_option_came_keeps_its_tables(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As it was when data had no strays."""
+    whole = results.asdict
+
+    def before(value: Any) -> dict[str, Any]:
+        return {key: told for key, told in whole(value).items() if key != "stray"}
+
+    with monkeypatch.context() as older:
+        older.setattr(results, "asdict", before)
+        do(tmp_path, "Again, nominal", "one")
+    assert titles(do(tmp_path, "Lift", "two", two_tables)) == ["Lift", "Again, nominal"]
 
 
 @pytest.mark.usefixtures("nothing_is_done")
