@@ -19,7 +19,7 @@ class Scripted:
     """A policy of three primitives that wants what it is told, row by row, and plans 100 k + (frame of the primitive)."""
 
     def __init__(self, wishes: list[list[int]], **config) -> None:
-        self.config = SimpleNamespace(**{"rollout": "closed_loop", "replan_every": 0, "filters": []} | config)
+        self.config = SimpleNamespace(**{"rollout": "closed_loop", "replan_every": 0, "plan_overlap": 0, "filters": []} | config)
         self.shortest_length, self.longest_length = torch.tensor(SHORTEST), torch.tensor(LONGEST)
         self.wishes, self.planned_from, self.means = iter(wishes), [], []
 

@@ -29,7 +29,7 @@ Termination = Literal["length", "learned"]
 
 _FREE = (
     "hidden_dim", "termination", "filter_frames", "long_filter_frames", "robust", "hand_noise", "split_forms",
-    "planner_balance", "planner_dropout", "planner_scale", "replan_every",
+    "planner_balance", "planner_dropout", "planner_scale", "replan_every", "plan_overlap",
 )  # fmt: skip
 """Options that may differ from the preset's value."""
 _FILTERS = ("filter_frames", "long_filter_frames")
@@ -60,8 +60,9 @@ class HDRILConfig(SingleFrameConfig):
     preset: str = ""
     """Name of a model in :data:`~lerobot_policy_hdril.presets.PRESETS`, which then decides the values of this group, and
     ``hidden_dim``. ``hidden_dim``, ``termination``, ``filter_frames``, ``long_filter_frames``, ``robust``, ``hand_noise``,
-    ``split_forms``, ``planner_balance``, ``planner_dropout``, ``planner_scale`` and ``replan_every`` may be given nevertheless,
-    where the model has a use for them. Empty to set them one by one. Once the policy has learned it is a name only."""
+    ``split_forms``, ``planner_balance``, ``planner_dropout``, ``planner_scale``, ``replan_every`` and ``plan_overlap`` may be
+    given nevertheless, where the model has a use for them. Empty to set them one by one. Once the policy has learned it is a name
+    only."""
     interaction: Interaction = "object"
     """Graph attention: ``none``; ``scalar``, the paper's node per number of the state; ``object``, a node per object."""
     skip: bool = True
@@ -110,7 +111,7 @@ class HDRILConfig(SingleFrameConfig):
     coordinates: Coordinates = "fused"
     """Of the dynamics. ``relational``: hands and predictions in the frame of the first object, as it stands when a plan is
     made. ``fused``: the linear maps predict the next actions in the world's and every object's frame, and the predictions
-    are fused by their precision; needs ``replan_every``, because it plans no further than it acts. The planner always sees
+    are fused by their precision; needs ``replan_every``, because it plans a few frames at a time. The planner always sees
     the world's."""
     latent: Latent = "deterministic"
     """``variational``: a Gaussian, sampled in training (paper, Figure 2)."""
@@ -125,6 +126,9 @@ class HDRILConfig(SingleFrameConfig):
     replan_every: int = 2
     """Make a new plan every so many frames within a primitive as well; 0: at its start alone. A policy that was trained
     with n can be run with 0 and with any multiple of n, unless its predictions are fused."""
+    plan_overlap: int = 1
+    """Frames that a plan reaches beyond the start of the next one. There the old plan fades into the new one, so that the hands
+    do not jerk from plan to plan; at most ``replan_every``. For ``coordinates=fused`` alone; it is 0 with others."""
 
     # Sizes.
     hidden_dim: int = 128
@@ -217,6 +221,8 @@ class HDRILConfig(SingleFrameConfig):
                 self.fourier_features = 0
             if "split_forms" not in self._given:
                 self.split_forms = False
+            if "plan_overlap" not in self._given:
+                self.plan_overlap = 0
         if self.termination != "learned" and "planner_balance" not in self._given:
             self.planner_balance = 0.0
         if self.interaction != "object" and "planner_scale" not in self._given:
@@ -289,6 +295,12 @@ class HDRILConfig(SingleFrameConfig):
             )
         if self.replan_every < 0:
             raise ValueError(f"policy.replan_every must be 0 (never) or more frames, got {self.replan_every}")
+        most = self.replan_every if self.coordinates == "fused" else 0
+        if not 0 <= self.plan_overlap <= most:
+            raise ValueError(
+                "policy.plan_overlap must be from 0 to policy.replan_every, and is for policy.coordinates=fused; "
+                f"got {self.plan_overlap}, {self.replan_every} and {self.coordinates}"
+            )
 
     def _check_fused(self) -> None:
         remedy = (
@@ -303,7 +315,7 @@ class HDRILConfig(SingleFrameConfig):
             )
         if self.decoder == "ode":
             raise ValueError(
-                "policy.decoder=ode is integrated over a plan, and policy.coordinates=fused plans no further than it acts; "
+                "policy.decoder=ode is integrated over a plan, and policy.coordinates=fused plans a few frames at a time; "
                 "give policy.coordinates=absolute"
             )
 

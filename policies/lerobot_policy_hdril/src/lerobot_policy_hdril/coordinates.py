@@ -48,6 +48,11 @@ def positive(poses: Tensor) -> Tensor:
     return torch.where((poses[..., 6:] < 0) & _TURNS.to(poses.device), -poses, poses)
 
 
+def towards(quaternion: Tensor, reference: Tensor) -> Tensor:
+    """Quaternions (..., 4), each with the sign that is nearer to ``reference``."""
+    return torch.where((quaternion * reference).sum(-1, keepdim=True) < 0, -quaternion, quaternion)
+
+
 @dataclass(frozen=True, eq=False)
 class Origins:
     """Where frames are, as the matrices that turn vectors and quaternions. For one running episode, they take a third of the time

@@ -119,7 +119,7 @@ def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Te
     policy.feature_std.copy_(single.std(0, correction=0).clamp_min(config.min_std)[frames.alike])
     if frames.fourier is not None:
         frames.fourier.fit(states, config.min_std)
-    rows = demonstrations.replan_rows(policy.ahead, episodes)
+    rows = demonstrations.replan_rows(policy.stride, episodes)
     executions = demonstrations.beginnings(episodes).sum(0)
     for k, form in enumerate(demonstrations.forms):
         # What is seldom shown is done as the primitive is done in general.
@@ -129,11 +129,11 @@ def _fit_fused(policy: HDRILPolicy, demonstrations: Demonstrations, episodes: Te
             else [k]
         )
         mine = torch.isin(demonstrations.label[rows], torch.tensor(alike, device=rows.device))
-        window = _window(demonstrations, rows[mine], policy.ahead, policy.ahead)
+        window = _window(demonstrations, rows[mine], policy.stride, policy.ahead)
         features = policy.features(window.seen)[0]
         cast(FusedMaps, maps[k]).fit(
             features,
-            torch.div(window.elapsed, policy.ahead, rounding_mode="floor"),
+            torch.div(window.elapsed, policy.stride, rounding_mode="floor"),
             frames,
             window.seen,
             window.target[..., : len(config.action_names)],

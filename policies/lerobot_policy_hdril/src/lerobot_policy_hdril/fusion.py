@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from lerobot_policy_hdril.coordinates import Origins, apply, positive, product, unit
+from lerobot_policy_hdril.coordinates import Origins, apply, positive, product, towards, unit
 from lerobot_policy_hdril.dynamics import FREE, solve_ridge, usual_windows
 from lerobot_policy_hdril.fourier import FourierFeatures
 from lerobot_policy_hdril.graph import node_of, pose_groups
@@ -382,7 +382,7 @@ class FusedMaps(nn.Module):
         far = apply(precision, means - means[:1]).sum(0)
         position = means[0] + torch.linalg.solve(precision.sum(0), far[..., None])[..., 0]
         rotations = unit(poses[..., 3:])
-        quaternion = (_towards(rotations, rotations[:1]) / self.variance.index_select(1, start)[..., None]).sum(0)
+        quaternion = (towards(rotations, rotations[:1]) / self.variance.index_select(1, start)[..., None]).sum(0)
         rest = (self.plain.index_select(0, start) * inputs).sum(-1)
         action = rest.new_empty(*rest.shape[:2], len(frames.rest) + frames.hands.numel())
         action[..., frames.rest] = rest
@@ -421,9 +421,5 @@ def _correlation(far: Tensor, weight: Tensor, whitening: Tensor, rotation: Tenso
 
 def _same_signs(poses: Tensor) -> Tensor:
     """Poses (F, N, ..., 7) whose quaternions have the sign that is nearer to those of the other windows."""
-    quaternion = _towards(poses[..., 3:], poses[:, :1, ..., 3:])  # so that they have a mean
-    return torch.cat([poses[..., :3], _towards(quaternion, quaternion.mean(1, keepdim=True))], dim=-1)
-
-
-def _towards(quaternion: Tensor, reference: Tensor) -> Tensor:
-    return torch.where((quaternion * reference).sum(-1, keepdim=True) < 0, -quaternion, quaternion)
+    quaternion = towards(poses[..., 3:], poses[:, :1, ..., 3:])  # so that they have a mean
+    return torch.cat([poses[..., :3], towards(quaternion, quaternion.mean(1, keepdim=True))], dim=-1)

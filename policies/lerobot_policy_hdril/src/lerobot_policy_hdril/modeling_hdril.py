@@ -17,7 +17,7 @@ from torch.nn import functional as F
 
 from lerobot_policy_hdril.card import model_card
 from lerobot_policy_hdril.configuration_hdril import HDRILConfig
-from lerobot_policy_hdril.coordinates import Origins, RelationalCoordinates, unit
+from lerobot_policy_hdril.coordinates import Origins, RelationalCoordinates, towards, unit
 from lerobot_policy_hdril.demonstrations import Demonstrations, History, Window
 from lerobot_policy_hdril.dynamics import PrimitiveDynamics, predict_stacked
 from lerobot_policy_hdril.explain import Attention, Explanation, attend, explain
@@ -109,7 +109,8 @@ class HDRILPolicy(PreTrainedPolicy):
         kinds = len(config.forms)
         models = kinds if config.per_primitive else 1
         fused = config.coordinates == "fused"
-        self.ahead = config.trained_replan_every if fused and config.trained_replan_every > 0 else self.capacity
+        self.stride = config.trained_replan_every if fused and config.trained_replan_every > 0 else self.capacity
+        self.ahead = self.stride + config.plan_overlap
         self.dynamics = nn.ModuleList(
             PrimitiveDynamics(
                 names,
@@ -151,7 +152,7 @@ class HDRILPolicy(PreTrainedPolicy):
             frames = self.frames = ObjectFrames(
                 names, config.environment_names, config.action_names, views, config.fourier_features
             )
-            starts = -(-self.capacity // self.ahead)
+            starts = -(-self.capacity // self.stride)
             self.fused = nn.ModuleList(FusedMaps(frames, starts, self.ahead) for _ in config.forms)
             self.register_buffer("feature_mean", torch.zeros(frames.dim))
             self.register_buffer("feature_std", torch.ones(frames.dim))
@@ -367,7 +368,7 @@ class HDRILPolicy(PreTrainedPolicy):
         """Normalised outputs (B, M, A + S) of the fused maps; 0 for the states, which they do not predict."""
         assert self.frames is not None
         assert self.fused is not None
-        (features, origins), start = self.features(seen), torch.div(elapsed, self.ahead, rounding_mode="floor")
+        (features, origins), start = self.features(seen), torch.div(elapsed, self.stride, rounding_mode="floor")
         actions = len(self.config.action_names)
         output = seen.new_zeros(len(seen), self.ahead, len(self.loss_weights))
         for k, mine in _rows_by_primitive(primitive):
@@ -451,8 +452,8 @@ class HDRILPolicy(PreTrainedPolicy):
         N is what remains of the longest form of the primitive; where the rows of a batch differ, shorter ones repeat their
         last action.
 
-        With ``coordinates=fused`` N is ``replan_every`` at most, and an episode must run: such a plan ends before the primitive
-        does, and alone could only ever begin it.
+        With ``coordinates=fused`` N is ``replan_every`` + ``plan_overlap`` at most, and an episode must run: such a plan ends
+        before the primitive does, and alone could only ever begin it. The actions of the overlap are those of this plan alone.
 
         Raises:
             RuntimeError: no episode runs, and ``coordinates=fused``.
@@ -513,6 +514,14 @@ class HDRILPolicy(PreTrainedPolicy):
         if len(self._quaternions):
             plan[..., self._quaternions] = unit(plan[..., self._quaternions])
         return plan
+
+    def fade(self, old: Tensor, new: Tensor, share: Tensor) -> Tensor:
+        """Between rows of two plans (B, M, A + S) for the same frames: ``share`` (M, 1) of ``new``, and the rest of ``old``."""
+        between = old.lerp(new, share)
+        if len(self._quaternions):
+            start, end = old[..., self._quaternions], new[..., self._quaternions]
+            between[..., self._quaternions] = unit(towards(start, end).lerp(end, share[..., None]))
+        return between
 
     # ------------------------------------------------------------------ what it tells of itself
 

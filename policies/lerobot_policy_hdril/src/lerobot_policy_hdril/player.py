@@ -27,6 +27,10 @@ class Predictor(Protocol):
         means of the last ones (B, 1 + W, S)."""
         ...
 
+    def fade(self, old: Tensor, new: Tensor, share: Tensor) -> Tensor:
+        """Between rows of two plans (B, M, A + S) for the same frames: ``share`` (M, 1) of ``new``, and the rest of ``old``."""
+        ...
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -87,8 +91,9 @@ def advance(policy: Predictor, previous: PlaybackState | None, observed: Tensor)
 
     The planner is asked at every frame. A primitive is over after its longest recorded length; before that, if the planner
     decides so (``termination=learned``), or from its shortest length on as soon as the planner prefers another. The same one
-    may be next. A plan is made at the start of a primitive, and every ``replan_every`` frames. In an open loop the state that
-    was predicted for this frame takes the place of the one that is seen.
+    may be next. A plan is made at the start of a primitive, and every ``replan_every`` frames; within a primitive, the last
+    ``plan_overlap`` frames of the plan before fade into it. In an open loop the state that was predicted for this frame takes the
+    place of the one that is seen.
     """
     if previous is not None and len(previous.primitive) != len(observed):
         previous = None
@@ -133,13 +138,28 @@ def _next_plan(
     due: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Plans, and the frames of the primitives at which they start; new ones for the episodes that are ``due`` (B,)."""
-    if previous is None or due.all():
+    if previous is None:
         return policy.plan(_seen(policy, recent), primitive, elapsed), elapsed
+    if due.all():
+        made = policy.plan(_seen(policy, recent), primitive, elapsed)
+        return _fade_in(policy, previous.plan, made, elapsed), elapsed
     rows = due.nonzero().squeeze(-1)
     if not len(rows):
         return previous.plan, previous.plan_start
     made = policy.plan(_seen(policy, recent[rows]), primitive[rows], elapsed[rows])
+    made = _fade_in(policy, previous.plan[rows], made, elapsed[rows])
     return previous.plan.index_copy(0, rows, made), torch.where(due, elapsed, previous.plan_start)
+
+
+def _fade_in(policy: Predictor, before: Tensor, made: Tensor, elapsed: Tensor) -> Tensor:
+    """Plans ``made`` (B, M, A + S) whose first ``plan_overlap`` rows are between them and the plans ``before``; where a primitive
+    begins, ``elapsed`` (B,) is 0, and they stay as they are."""
+    overlap, stride = policy.config.plan_overlap, policy.config.replan_every
+    if not overlap or not elapsed.any():
+        return made
+    share = torch.arange(1, overlap + 1, device=made.device)[:, None] / (overlap + 1.0)
+    faded = policy.fade(before[:, stride:], made[:, :overlap], share)
+    return torch.cat([made[:, :overlap].where((elapsed == 0)[:, None, None], faded), made[:, overlap:]], dim=1)
 
 
 def _seen(policy: Predictor, recent: Tensor) -> Tensor:

@@ -25,6 +25,7 @@ PLAIN: dict[str, Any] = {
     "planner_dropout": 0.0,
     "planner_scale": 0.0,
     "replan_every": 0,
+    "plan_overlap": 0,
 }
 """What the paper's models have: they look once a primitive, or never, and learn from all that they are shown."""
 
@@ -66,6 +67,7 @@ def _presets() -> dict[str, dict[str, Any]]:
         "planner_dropout": 0.2,
         "planner_scale": 0.05,
         "replan_every": 2,
+        "plan_overlap": 1,
         "decoder": "linear",
     }
     every["network_reactive"] = every["hdril_reactive"] | {"decoder": "gru"}
