@@ -16,10 +16,15 @@ SHORTEST, LONGEST = [3, 2, 4], [5, 6, 4]
 
 
 class Scripted:
-    """A policy of three primitives that wants what it is told, row by row, and plans 100 k + (frame of the primitive)."""
+    """A policy of three primitives that wants what it is told, row by row, and plans 100 k + (frame of the primitive), and
+    1000 times the frame at which it plans if its plans are to differ."""
+
+    apart = 0
 
     def __init__(self, wishes: list[list[int]], **config) -> None:
-        self.config = SimpleNamespace(**{"rollout": "closed_loop", "replan_every": 0, "plan_overlap": 0, "filters": []} | config)
+        self.config = SimpleNamespace(
+            **{"rollout": "closed_loop", "replan_every": 0, "plan_overlap": 0, "filters": []} | config
+        )
         self.shortest_length, self.longest_length = torch.tensor(SHORTEST), torch.tensor(LONGEST)
         self.wishes, self.planned_from, self.means = iter(wishes), [], []
 
@@ -30,9 +35,12 @@ class Scripted:
     def plan(self, seen, primitive, elapsed):
         self.planned_from.append((seen[:, 0, 0].tolist(), primitive.tolist(), elapsed.tolist()))
         self.means.append(seen[:, 1:, 0].tolist())
-        steps = 100 * primitive[:, None] + elapsed[:, None] + torch.arange(6)
+        steps = 100 * primitive[:, None] + elapsed[:, None] + torch.arange(6) + self.apart * seen[:, 0, :1]
         # One action, and one number of state.
         return torch.stack([steps, steps + 0.5], dim=-1)
+
+    def fade(self, old, new, share):
+        return old.lerp(new, share)
 
 
 def play(policy: Any, frames: int, rows: int = 1) -> list[PlaybackState]:
@@ -81,6 +89,38 @@ def test_plans_are_made_at_starts_and_every_so_many_frames(every: int, due: list
     assert [t for t, s in enumerate(states) if s.replanned[0]] == due
     assert [state[0] for state, _, _ in policy.planned_from] == due
     assert [s.row()[0, 0].item() for s in states] == [0, 1, 2, 100, 101, 102]
+
+
+class Fading(Scripted):
+    """Its plans reach no further than the overlap, as those of the fused maps do."""
+
+    apart = 1000
+
+    def plan(self, seen, primitive, elapsed):
+        return super().plan(seen, primitive, elapsed)[:, : self.config.replan_every + self.config.plan_overlap]
+
+
+@pytest.mark.parametrize(
+    ("overlap", "expected"),
+    [
+        (0, [0, 1, 2002, 2003, 4100, 4101, 6102, 6103]),
+        (1, [0, 1, 1002, 2003, 4100, 4101, 5102, 6103]),
+        (2, [0, 1, 2 + 2000 / 3, 3 + 4000 / 3, 4100, 4101, 4102 + 2000 / 3, 4103 + 4000 / 3]),
+    ],
+)
+def test_plans_fade_into_each_other_within_a_primitive_alone(overlap: int, expected: list[float]) -> None:
+    policy = Fading([[0], [0], [0], [0], [1], [1], [1], [1]], replan_every=2, plan_overlap=overlap)
+    told = [s.row()[0, 0].item() for s in play(policy, 8)]
+    assert told == pytest.approx(expected)
+
+
+def test_rows_of_a_batch_fade_by_themselves() -> None:
+    wishes = [[0, 2], [0, 2], [0, 2], [1, 2], [1, 1], [1, 1], [1, 1]]
+    told = [s.row()[:, 0].tolist() for s in play(Fading(wishes, replan_every=2, plan_overlap=1), 7, 2)]
+    assert list(zip(*told, strict=True)) == [
+        (0, 1, 1002, 3100, 3101, 4102, 5103),
+        (200, 201, 1202, 2203, 4100, 4101, 5102),
+    ]
 
 
 def test_open_loop_goes_on_from_the_predicted_state() -> None:

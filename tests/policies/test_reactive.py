@@ -17,7 +17,7 @@ from lerobot_policy_hdril.dynamics import StateSkip, ridge_penalty, solve_ridge,
 from lerobot_policy_hdril.fitting import noise_covariance
 from lerobot_policy_hdril.fusion import HAND as HAND_OWNER
 from lerobot_policy_hdril.fusion import NO_POSE, FusedMaps, ObjectFrames
-from lerobot_policy_hdril.graph import pose_groups
+from lerobot_policy_hdril.graph import pose_groups, quaternion_groups
 from lerobot_policy_hdril.hand_noise import ANGLE, REST, HandNoise
 from lerobot_policy_hdril.player import Choice
 from lerobot_policy_hdril.presets import PRESETS
@@ -674,8 +674,9 @@ def test_a_fused_policy_says_what_it_needs(metadata) -> None:
         HDRILConfig(device="cpu", push_to_hub=False, decoder="ode")
 
 
-def test_a_fused_plan_is_as_long_as_it_acts(metadata) -> None:
-    policy = build(metadata, coordinates="fused", replan_every=2).eval()
+@pytest.mark.parametrize("overlap", [0, 1, 2])
+def test_a_fused_plan_reaches_as_far_as_it_acts_and_overlaps(metadata, overlap: int) -> None:
+    policy = build(metadata, coordinates="fused", replan_every=2, plan_overlap=overlap).eval()
     seen = observation(metadata, [0, FRAMES])
     with pytest.raises(
         RuntimeError, match=r"^with policy\.coordinates=fused, predict_action_chunk .* policy\.preset=hdril$"
@@ -683,7 +684,25 @@ def test_a_fused_plan_is_as_long_as_it_acts(metadata) -> None:
         policy.predict_action_chunk(seen)
     for left in (1, 2, 1):
         policy.select_action(seen)
-        assert policy.predict_action_chunk(seen).shape == (2, left, 16)
+        assert policy.predict_action_chunk(seen).shape == (2, left + overlap, 16)
+
+
+def test_what_is_between_two_plans_is_a_pose_whatever_the_quaternions_signs(metadata) -> None:
+    policy = build(metadata, coordinates="fused", replan_every=2, plan_overlap=1)
+    old, new = (turned(3, 0.3, generator(seed)).float() for seed in (1, 2))
+    columns = quaternion_groups(policy.config.action_names)[0]
+    plans = []
+    for quaternion in (old, -new):
+        plan = torch.zeros(3, 1, len(policy.loss_weights))
+        plan[:, 0, columns] = quaternion
+        plan[:, 0, 0] = float(len(plans))
+        plans.append(plan)
+    between = policy.fade(*plans, torch.tensor([[0.5]]))
+    assert (between[:, 0, 0] == 0.5).all()
+    half = rotations(old) * Rotation.from_rotvec(0.5 * (rotations(old).inv() * rotations(new)).as_rotvec())
+    far = rotations(between[:, 0, columns]) * half.inv()
+    assert far.magnitude().max() < 1e-3
+    torch.testing.assert_close(between[:, 0, columns].norm(dim=-1), torch.ones(3))
 
 
 # ---------------------------------------------------------------------- noise of the hands
