@@ -127,7 +127,7 @@ class HDRILConfig(SingleFrameConfig):
     """Make a new plan every so many frames within a primitive as well; 0: at its start alone. A policy that was trained
     with n can be run with 0 and with any multiple of n, unless its predictions are fused."""
     plan_overlap: int = 1
-    """Frames that a plan reaches beyond the start of the next one. There the old plan fades into the new one, so that the hands
+    """First frames of the next plan that a plan covers as well. There the old plan fades into the new one, so that the hands
     do not jerk from plan to plan; at most ``replan_every``. For ``coordinates=fused`` alone; it is 0 with others."""
 
     # Sizes.

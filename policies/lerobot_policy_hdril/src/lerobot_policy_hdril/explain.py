@@ -43,7 +43,7 @@ class Explanation:
     """The planner's, by primitive; they sum to 1."""
     plan: NDArray[np.float32] | None
     """Actions (M, A) from this frame to the end of the plan, if it was made at this frame; None otherwise. It ends with
-    the longest recorded form of the primitive."""
+    the longest recorded form of the primitive, or before."""
     attention: dict[str, float]
     """Share of the dynamics model's attention that each hand and object receives, or of the planner's where the dynamics are
     linear maps, which attend to nobody; the shares sum to 1."""

@@ -42,7 +42,8 @@ MOVED = 0.03
 """Distance from its longest mean, m, at which an object counts as just moved, in the median of the demonstrations. It goes with a
 mean of 24 frames at 10 frames a second; without a mean, nothing counts as moved."""
 SUPPORT = 0.5
-"""Share of a primitive's executions that must reach a start for it to have a map to itself."""
+"""Share of a primitive's executions that must reach a start for it to have a map to itself, and of a start's windows that must
+reach a step."""
 HAND, NO_POSE = -1, -2  # owners of numbers that are no object's with a pose
 
 
@@ -257,8 +258,9 @@ class FusedMaps(nn.Module):
         """Solve the maps, in float64, see :func:`~lerobot_policy_hdril.dynamics.solve_ridge`.
 
         Starts that less than half of the executions reach share the maps of the last one that enough reach, which are fitted to
-        the windows of all of them: few windows cannot fit so many numbers. Where an execution has several windows there, the
-        leave-one-out errors are too small, because its other windows stay.
+        the windows of all of them: few windows cannot fit so many numbers. So do steps that less than half of a start's windows
+        reach: they are as the step before. Where an execution has several windows there, the leave-one-out errors are too small,
+        because its other windows stay.
 
         Args:
             features: what the maps see (N, W): normalised features, and the Fourier features.
@@ -298,18 +300,23 @@ class FusedMaps(nn.Module):
             least = F.pad(least, (0, 1), value=FREE)
             if robust:
                 rows = usual_windows(inputs, action[:, 0].double(), rows, least[0, 0, 0].diag() + rows.sum() * noise)
-            counts, begin = (mask & rows[:, None]).sum(0).tolist(), 0
-            for count, steps in groupby(counts):  # steps that the same rows have are solved together
+            counts = (mask & rows[:, None]).sum(0)
+            shown, begin = counts[counts >= SUPPORT * counts[0]].tolist(), 0
+            for _, steps in groupby(shown):  # steps that the same rows have are solved together
                 end = begin + len(list(steps))
-                if count:
-                    here = rows & mask[:, begin]
-                    targets = poses[:, here, begin:end], rest[here, begin:end]
-                    self._fit_steps(first, begin, inputs[here], *targets, rotation[:, here], least, noise, shrinkage)
+                here = rows & mask[:, begin]
+                targets = poses[:, here, begin:end], rest[here, begin:end]
+                self._fit_steps(first, begin, inputs[here], *targets, rotation[:, here], least, noise, shrinkage)
                 begin = end
-        by_frame = (self.weight, self.whitening, self.variance)
-        for buffer, starts in (*((each, 1) for each in by_frame), (self.plain, 0), (self.agreement, 0)):
-            by_start = buffer.movedim(starts, 0)
+            for by_start in self._by_start():
+                by_start[first, begin:] = by_start[first, begin - 1]
+        for by_start in self._by_start():
             by_start[last + 1 :] = by_start[last]
+
+    def _by_start(self) -> list[Tensor]:
+        """All buffers, their starts and steps first."""
+        by_frame = [each.movedim(0, 2) for each in (self.weight, self.whitening, self.variance)]
+        return [*by_frame, self.plain, self.agreement]
 
     def _fit_steps(
         self,

@@ -453,7 +453,7 @@ class HDRILPolicy(PreTrainedPolicy):
         last action.
 
         With ``coordinates=fused`` N is ``replan_every`` + ``plan_overlap`` at most, and an episode must run: such a plan ends
-        before the primitive does, and alone could only ever begin it. The actions of the overlap are those of this plan alone.
+        before the primitive does, and alone could only ever begin it. Its last ``plan_overlap`` actions have not faded yet.
 
         Raises:
             RuntimeError: no episode runs, and ``coordinates=fused``.

@@ -157,7 +157,7 @@ def _fade_in(policy: Predictor, before: Tensor, made: Tensor, elapsed: Tensor) -
     overlap, stride = policy.config.plan_overlap, policy.config.replan_every
     if not overlap or not elapsed.any():
         return made
-    share = torch.arange(1, overlap + 1, device=made.device)[:, None] / (overlap + 1.0)
+    share = torch.arange(1, overlap + 1, dtype=made.dtype, device=made.device)[:, None] / (overlap + 1.0)
     faded = policy.fade(before[:, stride:], made[:, :overlap], share)
     return torch.cat([made[:, :overlap].where((elapsed == 0)[:, None, None], faded), made[:, overlap:]], dim=1)
 
