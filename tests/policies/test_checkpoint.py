@@ -238,6 +238,21 @@ def test_checkpoint_from_before_the_second_scale_acts_without_it(metadata, tmp_p
     assert torch.equal(older.select_action(first), saved.select_action(first))
 
 
+def test_checkpoint_from_before_plans_overlapped_acts_without_it(metadata, tmp_path: Path) -> None:
+    saved = build(metadata, preset="hdril_reactive", plan_overlap=0).eval()
+    saved.save_pretrained(tmp_path / "older")
+    without(tmp_path / "older", ["plan_overlap"])
+    older = load(tmp_path / "older")
+    assert older.config.plan_overlap == 0
+    for frame in range(4):
+        seen = observation(metadata, [frame])
+        assert torch.equal(older.select_action(seen), saved.select_action(seen))
+    build(metadata, preset="hdril_reactive", plan_overlap=2).save_pretrained(tmp_path / "two")
+    assert load(tmp_path / "two").config.plan_overlap == 2
+    with pytest.raises((ValueError, ParsingError)):
+        load(tmp_path / "two", "--plan_overlap=1")
+
+
 def test_older_checkpoint_whose_maps_were_fused_in_another_way_is_refused(metadata, tmp_path: Path) -> None:
     build(metadata, preset="hdril_reactive", hidden_dim=32).save_pretrained(tmp_path)
     without(tmp_path, ["fusion_shrinkage"])

@@ -114,13 +114,20 @@ def test_plans_fade_into_each_other_within_a_primitive_alone(overlap: int, expec
     assert told == pytest.approx(expected)
 
 
-def test_rows_of_a_batch_fade_by_themselves() -> None:
-    wishes = [[0, 2], [0, 2], [0, 2], [1, 2], [1, 1], [1, 1], [1, 1]]
-    told = [s.row()[:, 0].tolist() for s in play(Fading(wishes, replan_every=2, plan_overlap=1), 7, 2)]
-    assert list(zip(*told, strict=True)) == [
-        (0, 1, 1002, 3100, 3101, 4102, 5103),
-        (200, 201, 1202, 2203, 4100, 4101, 5102),
-    ]
+@pytest.mark.parametrize(
+    ("wishes", "expected"),
+    [
+        (
+            [[0, 2]] * 3 + [[1, 2]] + [[1, 1]] * 3,
+            [(0, 1, 1002, 3100, 3101, 4102, 5103), (200, 201, 1202, 2203, 4100, 4101, 5102)],
+        ),
+        # At the fifth frame the one row begins, and the plan of the other is made anew.
+        ([[0, 1]] * 4 + [[1, 1]] * 2, [(0, 1, 1002, 2003, 4100, 4101), (100, 101, 1102, 2103, 3104, 4105)]),
+    ],
+)
+def test_rows_of_a_batch_fade_by_themselves(wishes: list[list[int]], expected: list[tuple[float, ...]]) -> None:
+    states = play(Fading(wishes, replan_every=2, plan_overlap=1), len(wishes), 2)
+    assert list(zip(*(s.row()[:, 0].tolist() for s in states), strict=True)) == expected
 
 
 def test_open_loop_goes_on_from_the_predicted_state() -> None:

@@ -493,6 +493,40 @@ def test_starts_that_few_executions_reach_share_maps_with_the_one_before(late: i
     assert torch.equal(told[1], told[2]) is not alone
 
 
+@pytest.mark.parametrize(("longer", "shown"), [(50, True), (49, False), (1, False), (0, False)])
+def test_a_step_that_few_windows_reach_is_as_the_one_before(longer: int, shown: bool) -> None:
+    frames = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION).double()
+    maps, seen = FusedMaps(frames, 2, 3).double(), scenes(100, 2)[:, None]
+    start = torch.zeros(100, dtype=torch.long)
+    action = torch.cat([at_cup(seen[:, 0]), torch.zeros(100, 1).double()], dim=-1)[:, None].repeat(1, 3, 1)
+    action[..., 2] += 0.1 * torch.arange(3)
+    mask, noise = torch.ones(100, 3, dtype=torch.bool), torch.zeros(frames.dim, frames.dim)
+    mask[longer:, 2] = False
+    maps.fit(frames.features(seen), start, frames, seen, action, mask, LEAST, False, noise, SHRINKAGE)
+    for late in (start, start + 1):  # which share the maps
+        told = maps(frames.features(seen), late, frames, frames.origins(seen))
+        rise = (told[..., 2] - action[:, :1, 2]).mean(0)
+        assert rise.tolist() == pytest.approx([0.0, 0.1, 0.2 if shown else 0.1], abs=0.01)
+        assert torch.equal(told[:, 1], told[:, 2]) is not shown
+
+
+def test_a_plan_tells_the_first_frame_of_the_next_one(metadata) -> None:
+    # Of demonstrations that agree, at every frame at which a plan is made.
+    policy = build(metadata, preset="hdril_reactive", fourier_features=0).eval()
+    data = demonstrations(policy)
+    everything = torch.ones(len(data.episode_index), dtype=torch.bool)
+    rows = data.replan_rows(2, everything)
+    first = data.window(rows, 2, 3)
+    goes_on = first.mask[:, 2]
+    told = policy.plan(first.seen, first.primitive, first.elapsed)[goes_on]
+    later = data.window(rows[goes_on] + 2, 2, 1).target[:, 0]
+    actions = len(policy.config.action_names)
+    assert goes_on.sum() > 20
+    far = (told[:, 2, :actions] - later[:, :actions]).abs().amax(-1)
+    near = (told[:, 0, :actions] - first.target[goes_on, 0, :actions]).abs().amax(-1)
+    assert max(near.median(), far.median()) < 5e-3  # with maps of other starts, 1 cm and more
+
+
 def test_from_few_demonstrations_it_helps_to_know_what_a_frame_sees() -> None:
     """The hand is to go half of the way to the cup's side; what is seen from elsewhere says nothing."""
     frames, noise = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION, 3).double(), 2e-3
@@ -690,19 +724,22 @@ def test_a_fused_plan_reaches_as_far_as_it_acts_and_overlaps(metadata, overlap: 
 def test_what_is_between_two_plans_is_a_pose_whatever_the_quaternions_signs(metadata) -> None:
     policy = build(metadata, coordinates="fused", replan_every=2, plan_overlap=1)
     old, new = (turned(3, 0.3, generator(seed)).float() for seed in (1, 2))
-    columns = quaternion_groups(policy.config.action_names)[0]
+    hands = quaternion_groups(policy.config.action_names)
     plans = []
-    for quaternion in (old, -new):
-        plan = torch.zeros(3, 1, len(policy.loss_weights))
-        plan[:, 0, columns] = quaternion
-        plan[:, 0, 0] = float(len(plans))
+    for sign, quaternion in ((1.0, old), (-1.0, new)):
+        plan = torch.zeros(3, 2, len(policy.loss_weights))
+        plan[..., hands] = sign * quaternion[:, None, None]
+        plan[..., 0] = float(len(plans))
         plans.append(plan)
-    between = policy.fade(*plans, torch.tensor([[0.5]]))
-    assert (between[:, 0, 0] == 0.5).all()
-    half = rotations(old) * Rotation.from_rotvec(0.5 * (rotations(old).inv() * rotations(new)).as_rotvec())
-    far = rotations(between[:, 0, columns]) * half.inv()
-    assert far.magnitude().max() < 1e-3
-    torch.testing.assert_close(between[:, 0, columns].norm(dim=-1), torch.ones(3))
+    between = policy.fade(*plans, torch.tensor([[0.25], [0.75]]))
+    for step, share in enumerate((0.25, 0.75)):
+        assert (between[:, step, 0] == share).all()
+        turn = share * (rotations(old).inv() * rotations(new)).as_rotvec()
+        for columns in hands:
+            told = between[:, step, columns]
+            far = rotations(told) * (rotations(old) * Rotation.from_rotvec(turn)).inv()
+            assert far.magnitude().max() < 2e-3
+            torch.testing.assert_close(told.norm(dim=-1), torch.ones(3))
 
 
 # ---------------------------------------------------------------------- noise of the hands
