@@ -23,7 +23,8 @@ class Scripted:
 
     def __init__(self, wishes: list[list[int]], **config) -> None:
         self.config = SimpleNamespace(
-            **{"rollout": "closed_loop", "replan_every": 0, "plan_overlap": 0, "filters": []} | config
+            **{"rollout": "closed_loop", "replan_every": 0, "plan_overlap": 0, "least_survival": 0.0, "filters": []}
+            | config
         )
         self.shortest_length, self.longest_length = torch.tensor(SHORTEST), torch.tensor(LONGEST)
         self.wishes, self.planned_from, self.means = iter(wishes), [], []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -86,6 +87,31 @@ def test_the_planner_decides_at_any_frame_what_goes_on_and_what_begins() -> None
 def test_a_primitive_ends_at_its_longest_length_whatever_the_planner_says() -> None:
     states = play(Deciding([(0, 0.0)] + [(1, 0.9)] * 5), 6)
     assert [(int(s.primitive), int(s.elapsed)) for s in states][-2:] == [(0, 4), (1, 0)]
+
+
+@pytest.mark.parametrize(("least", "given_up"), [(0.0, None), (0.3, 15), (0.5, 10), (0.6, 10), (0.7, 5)])
+def test_a_primitive_that_would_begin_again_is_given_up_when_doubts_have_added_up(
+    least: float, given_up: int | None
+) -> None:
+    # It is over after five frames. At four of them the planner would have begun another with a probability of a tenth, most often
+    # the third: 0.66 are left at the fifth frame, 0.43 at the tenth and 0.28 at the fifteenth.
+    wishes = [(0, 0.0), *(((1 if t % 5 == 3 else 2), 0.9) if t % 5 else (0, 0.0) for t in range(1, 16))]
+    policy = Deciding(wishes, least_survival=least)
+    states = play(policy, 16)
+    told = [(int(s.primitive), int(s.gave_up)) for s in states]
+    last = 16 if given_up is None else given_up
+    assert told[:last] == [(0, -1)] * last
+    if given_up is not None:
+        assert told[given_up] == (2, 0)
+        assert (int(states[given_up].elapsed), states[given_up].doubt.tolist()) == (0, [[0.0, 0.0, 0.0]])
+
+
+def test_doubts_do_not_end_a_primitive_that_goes_on_and_end_with_it() -> None:
+    policy = Deciding([(0, 0.0), (1, 0.6), (1, 0.6), (1, 0.6), (2, 0.3), (2, 0.9)], least_survival=0.9)
+    states = play(policy, 6)
+    assert [(int(s.primitive), int(s.gave_up)) for s in states] == [(0, -1)] * 4 + [(2, -1)] * 2
+    assert states[3].doubt[0].tolist() == pytest.approx([0.0, -3.0 * math.log(0.6), 0.0])
+    assert states[4].doubt[0].tolist() == [0.0, 0.0, 0.0]
 
 
 def test_what_goes_on_counts_as_the_primitive_that_plays() -> None:

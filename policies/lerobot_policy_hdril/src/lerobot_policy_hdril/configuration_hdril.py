@@ -29,7 +29,7 @@ Termination = Literal["length", "learned"]
 
 _FREE = (
     "hidden_dim", "termination", "filter_frames", "long_filter_frames", "robust", "hand_noise", "split_forms",
-    "planner_balance", "planner_dropout", "planner_scale", "replan_every", "plan_overlap",
+    "planner_balance", "planner_dropout", "planner_scale", "least_survival", "replan_every", "plan_overlap",
 )  # fmt: skip
 """Options that may differ from the preset's value."""
 _FILTERS = ("filter_frames", "long_filter_frames")
@@ -60,9 +60,9 @@ class HDRILConfig(SingleFrameConfig):
     preset: str = ""
     """Name of a model in :data:`~lerobot_policy_hdril.presets.PRESETS`, which then decides the values of this group, and
     ``hidden_dim``. ``hidden_dim``, ``termination``, ``filter_frames``, ``long_filter_frames``, ``robust``, ``hand_noise``,
-    ``split_forms``, ``planner_balance``, ``planner_dropout``, ``planner_scale``, ``replan_every`` and ``plan_overlap`` may be
-    given nevertheless, where the model has a use for them. Empty to set them one by one. Once the policy has learned it is a name
-    only."""
+    ``split_forms``, ``planner_balance``, ``planner_dropout``, ``planner_scale``, ``least_survival``, ``replan_every`` and
+    ``plan_overlap`` may be given nevertheless, where the model has a use for them. Empty to set them one by one. Once the policy
+    has learned it is a name only."""
     interaction: Interaction = "object"
     """Graph attention: ``none``; ``scalar``, the paper's node per number of the state; ``object``, a node per object."""
     skip: bool = True
@@ -102,6 +102,11 @@ class HDRILConfig(SingleFrameConfig):
     planner_scale: float = 0.05
     """The planner sees the position p of each pose as asinh(p / planner_scale), too, m; 0: not. For ``interaction=object`` alone;
     it is 0 with others."""
+    least_survival: float = 0.3
+    """A primitive begins again only if, by all that the planner said since it began first, the probability that nothing else
+    began is at least this. If it is less, the primitive is given up for what would most probably have begun; 0: never. A planner
+    may doubt at each frame that something is still held, and at none enough. For ``termination=learned`` alone; it is 0 with
+    others.""" ""
     per_primitive: bool = True
     """One dynamics model per primitive (the paper's Multi), or one for all that is told the primitive. Fused linear maps are one
     for each in any case."""
@@ -196,7 +201,7 @@ class HDRILConfig(SingleFrameConfig):
         }
     )
 
-    running_options = frozenset({"samples", "rollout", "replan_every", "experts"})
+    running_options = frozenset({"samples", "rollout", "replan_every", "experts", "least_survival"})
     """What of a trained policy may change when it is run; everything else acts in training, or its weights have fixed it."""
 
     _given = frozenset[str]()
@@ -223,8 +228,10 @@ class HDRILConfig(SingleFrameConfig):
                 self.split_forms = False
             if "plan_overlap" not in self._given:
                 self.plan_overlap = 0
-        if self.termination != "learned" and "planner_balance" not in self._given:
-            self.planner_balance = 0.0
+        if self.termination != "learned":
+            for name in ("planner_balance", "least_survival"):
+                if name not in self._given:
+                    setattr(self, name, 0.0)
         if self.interaction != "object" and "planner_scale" not in self._given:
             self.planner_scale = 0.0
         if self.coordinates != "fused" and "decoder" not in self._given and not self.preset:
@@ -285,6 +292,11 @@ class HDRILConfig(SingleFrameConfig):
             raise ValueError(
                 "policy.planner_balance must be from 0 to 1, and is for policy.termination=learned; "
                 f"got {self.planner_balance} and {self.termination}"
+            )
+        if not 0.0 <= self.least_survival < 1.0 or (self.least_survival and self.termination != "learned"):
+            raise ValueError(
+                "policy.least_survival must be from 0 to less than 1, and is for policy.termination=learned; "
+                f"got {self.least_survival} and {self.termination}"
             )
         if not 0.0 <= self.planner_dropout < 1.0:
             raise ValueError(f"policy.planner_dropout must be from 0 to less than 1, got {self.planner_dropout}")

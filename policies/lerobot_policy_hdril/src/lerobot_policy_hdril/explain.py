@@ -86,8 +86,10 @@ def explain(policy: HDRILPolicy, playback: PlaybackState, row: int) -> Explanati
 
 
 def _events(names: list[str], playback: PlaybackState, row: int) -> tuple[str, ...]:
-    """A primitive that begins for the second time or later."""
+    """A primitive that was given up, and one that begins for the second time or later."""
+    gave_up = int(playback.gave_up[row])
+    told = () if gave_up < 0 else (f"{names[gave_up]} given up",)
     playing = int(playback.primitive[row])
     alike = torch.tensor([name == names[playing] for name in names])
     again = int(playback.elapsed[row]) == 0 and int(playback.begun[row, alike].sum()) > 1
-    return (f"{names[playing]} tried again",) if again else ()
+    return (*told, f"{names[playing]} tried again") if again else told

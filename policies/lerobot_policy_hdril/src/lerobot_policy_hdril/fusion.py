@@ -273,7 +273,7 @@ class FusedMaps(nn.Module):
                 steps that are solved together, the first ones count whose mean squared leave-one-out error of the hands'
                 positions, noise included, is at most :data:`CLEARLY` times the least. What is no pose has the world's. The
                 robust fit takes the first. With these penalties, maps bend where :data:`BENDS` lets them.
-            robust: leave out windows that are far off a first fit.
+            robust: leave out windows that are far off a first fit in every frame.
             noise: covariance (W, W) of noise on the features that the maps are to bear; 0 for none. The penalty grows as if every
                 window were seen with such noise, and the covariance of a frame's errors by what the noise adds to them.
             shrinkage: how far correlations of the frames' errors are shrunk towards 0: with 1, frames count as independent.
@@ -299,7 +299,7 @@ class FusedMaps(nn.Module):
             )
             least = F.pad(least, (0, 1), value=FREE)
             if robust:
-                rows = usual_windows(inputs, action[:, 0].double(), rows, least[0, 0, 0].diag() + rows.sum() * noise)
+                rows = self._usual(inputs, poses[:, :, 0], rest[:, 0], rows, least[0, 0], noise)
             counts = (mask & rows[:, None]).sum(0)
             shown, begin = counts[counts >= SUPPORT * counts[0]].tolist(), 0
             for _, steps in groupby(shown):  # steps that the same rows have are solved together
@@ -312,6 +312,19 @@ class FusedMaps(nn.Module):
                 by_start[first, begin:] = by_start[first, begin - 1]
         for by_start in self._by_start():
             by_start[last + 1 :] = by_start[last]
+
+    @staticmethod
+    def _usual(x: Tensor, poses: Tensor, rest: Tensor, rows: Tensor, least: Tensor, noise: Tensor) -> Tensor:
+        """Which of the windows ``rows`` (N,) are near a robust fit in at least one frame (N,): of x (N, W + 1) to the first poses
+        (1 + V F, N, G, 7) and the rest of the first action (N, A - 7 G), with penalties (1 + V F, W + 1).
+
+        What is far off in one frame may be as usual in another. To an object that lies askew, a hand goes as it always does
+        in the object's frame, and as it never does in the world's: such windows tell which frame knows."""
+        near, signed = torch.zeros_like(rows), _same_signs(poses)
+        for seen_from, penalty in zip(signed, least, strict=True):
+            target = torch.cat([seen_from.flatten(1), rest], dim=-1)
+            near |= usual_windows(x, target, rows, penalty.diag() + rows.sum() * noise)
+        return near
 
     def _by_start(self) -> list[Tensor]:
         """All buffers, their starts and steps first."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from typing import Protocol
 
@@ -59,6 +60,8 @@ class PlaybackState:
     probabilities: Tensor  # (B, K), the planner's at this frame
     recent: Tensor  # (B, n, S), the last states, no more than the filters need: observed, or predicted in an open loop
     begun: Tensor  # (B, K), how often each primitive has begun
+    doubt: Tensor  # (B, K), hazard that each other primitive begins, added up since this one began for the first time in a row
+    gave_up: Tensor  # (B,), the primitive that was given up at this frame; -1 where none was
     memory: Tensor  # (1, B, H), the planner's
 
     @property
@@ -91,9 +94,11 @@ def advance(policy: Predictor, previous: PlaybackState | None, observed: Tensor)
 
     The planner is asked at every frame. A primitive is over after its longest recorded length; before that, if the planner
     decides so (``termination=learned``), or from its shortest length on as soon as the planner prefers another. The same one
-    may be next. A plan is made at the start of a primitive, and every ``replan_every`` frames; within a primitive, the last
-    ``plan_overlap`` frames of the plan before fade into it. In an open loop the state that was predicted for this frame takes the
-    place of the one that is seen.
+    may be next, unless the planner's doubts have added up (``least_survival``): then it is given up for another.
+
+    A plan is made at the start of a primitive, and every ``replan_every`` frames; within a primitive, the last ``plan_overlap``
+    frames of the plan before fade into it. In an open loop the state that was predicted for this frame takes the place of the
+    one that is seen.
     """
     if previous is not None and len(previous.primitive) != len(observed):
         previous = None
@@ -101,7 +106,12 @@ def advance(policy: Predictor, previous: PlaybackState | None, observed: Tensor)
     if previous is not None and policy.config.rollout == "open_loop":
         state = previous.row()[:, -observed.shape[-1] :]
     choice = policy.choose(state, previous)
-    primitive, elapsed = _next_primitive(policy, previous, choice)
+    doubt = torch.zeros_like(choice.begin)
+    if previous is not None and policy.config.least_survival:
+        doubt = _doubt(previous, choice)
+    primitive, elapsed, gave_up = _next_primitive(policy, previous, choice, doubt)
+    if previous is not None:
+        doubt = doubt * (primitive == previous.primitive)[:, None]
     probabilities = choice.begin if previous is None else choice.probabilities(previous.primitive)
     recent = state[:, None]
     if previous is not None:
@@ -112,21 +122,37 @@ def advance(policy: Predictor, previous: PlaybackState | None, observed: Tensor)
     if policy.config.replan_every:
         replanned = elapsed % policy.config.replan_every == 0
     plan, plan_start = _next_plan(policy, previous, recent, primitive, elapsed, replanned)
-    return PlaybackState(primitive, elapsed, plan, plan_start, replanned, probabilities, recent, begun, choice.memory)
+    return PlaybackState(
+        primitive, elapsed, plan, plan_start, replanned, probabilities, recent, begun, doubt, gave_up, choice.memory
+    )
 
 
-def _next_primitive(policy: Predictor, previous: PlaybackState | None, choice: Choice) -> tuple[Tensor, Tensor]:
-    """Primitives (B,) of this frame, and how many of their frames are over."""
+def _doubt(previous: PlaybackState, choice: Choice) -> Tensor:
+    """(B, K): -log of the probability that the primitive that plays survives all frames since it began, as a sum over what might
+    have begun in its place. That it begins again is no doubt."""
+    others = choice.begin.scatter(1, previous.primitive[:, None], 0.0)
+    hazard = others.sum(-1, keepdim=True).clamp(1e-9, 1.0 - 1e-6)
+    return previous.doubt - torch.log1p(-hazard) / hazard * others
+
+
+def _next_primitive(
+    policy: Predictor, previous: PlaybackState | None, choice: Choice, doubt: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Primitives (B,) of this frame, how many of their frames are over, and those that were given up, -1 where none was."""
     highest, best = choice.begin.max(-1)
     if previous is None:
-        return best, torch.zeros_like(best)
+        return best, torch.zeros_like(best), torch.full_like(best, -1)
     playing, elapsed = previous.primitive, previous.elapsed + 1
     over = elapsed >= policy.longest_length[playing]
     if choice.go_on is None:
         over |= (elapsed >= policy.shortest_length[playing]) & (best != playing)
     else:
         over |= highest > choice.go_on
-    return torch.where(over, best, playing), torch.where(over, 0, elapsed)
+    gave_up = torch.zeros_like(over)
+    if policy.config.least_survival:
+        gave_up = over & (best == playing) & (doubt.sum(-1) > -math.log(policy.config.least_survival))
+        best = torch.where(gave_up, doubt.argmax(-1), best)
+    return torch.where(over, best, playing), torch.where(over, 0, elapsed), torch.where(gave_up, playing, -1)
 
 
 def _next_plan(

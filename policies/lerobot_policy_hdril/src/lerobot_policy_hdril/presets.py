@@ -24,6 +24,7 @@ PLAIN: dict[str, Any] = {
     "planner_balance": 0.0,
     "planner_dropout": 0.0,
     "planner_scale": 0.0,
+    "least_survival": 0.0,
     "replan_every": 0,
     "plan_overlap": 0,
 }
@@ -66,6 +67,7 @@ def _presets() -> dict[str, dict[str, Any]]:
         "planner_balance": 0.5,
         "planner_dropout": 0.2,
         "planner_scale": 0.05,
+        "least_survival": 0.3,
         "replan_every": 2,
         "plan_overlap": 1,
         "decoder": "linear",
