@@ -122,7 +122,13 @@ def test_options_with_effect_are_taken(act: Path) -> None:
 def test_each_option_of_hdril_acts_or_is_refused(name: str, hdril: Path) -> None:
     """The policy says which of its options act; that they do is tested with the policy."""
     found = find_checkpoint(str(hdril))
-    acting = {"experts": "stacked", "replan_every": "0", "rollout": "open_loop", "samples": "0", "least_survival": "0"}
+    acting = {
+        "experts": "stacked",
+        "replan_every": "0",
+        "rollout": "open_loop",
+        "samples": "0",
+        "least_survival": "0.0",
+    }
     if name in acting:
         assert str(vars(resolve_config(found, (f"--{name}={acting[name]}",)))[name]) == acting[name]
         return

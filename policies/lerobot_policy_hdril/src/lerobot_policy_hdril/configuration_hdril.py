@@ -106,7 +106,7 @@ class HDRILConfig(SingleFrameConfig):
     """A primitive begins again only if, by all that the planner said since it began first, the probability that nothing else
     began is at least this. If it is less, the primitive is given up for what would most probably have begun; 0: never. A planner
     may doubt at each frame that something is still held, and at none enough. For ``termination=learned`` alone; it is 0 with
-    others.""" ""
+    others."""
     per_primitive: bool = True
     """One dynamics model per primitive (the paper's Multi), or one for all that is told the primitive. Fused linear maps are one
     for each in any case."""

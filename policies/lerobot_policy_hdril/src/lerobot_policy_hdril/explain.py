@@ -87,9 +87,9 @@ def explain(policy: HDRILPolicy, playback: PlaybackState, row: int) -> Explanati
 
 def _events(names: list[str], playback: PlaybackState, row: int) -> tuple[str, ...]:
     """A primitive that was given up, and one that begins for the second time or later."""
-    gave_up = int(playback.gave_up[row])
-    told = () if gave_up < 0 else (f"{names[gave_up]} given up",)
-    playing = int(playback.primitive[row])
+    gave_up, playing = int(playback.gave_up[row]), int(playback.primitive[row])
+    # For another form of the same one: to everybody else that is the same primitive.
+    told = () if gave_up < 0 or names[gave_up] == names[playing] else (f"{names[gave_up]} given up",)
     alike = torch.tensor([name == names[playing] for name in names])
     again = int(playback.elapsed[row]) == 0 and int(playback.begun[row, alike].sum()) > 1
     return (*told, f"{names[playing]} tried again") if again else told

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lerobot_policy_hdril.coordinates import Origins, apply, positive, product, towards, unit
-from lerobot_policy_hdril.dynamics import FREE, solve_ridge, usual_windows
+from lerobot_policy_hdril.dynamics import FREE, robust_distances, solve_ridge, usual
 from lerobot_policy_hdril.fourier import FourierFeatures
 from lerobot_policy_hdril.graph import node_of, pose_groups
 
@@ -315,15 +315,19 @@ class FusedMaps(nn.Module):
 
     @staticmethod
     def _usual(x: Tensor, poses: Tensor, rest: Tensor, rows: Tensor, least: Tensor, noise: Tensor) -> Tensor:
-        """Which of the windows ``rows`` (N,) are near a robust fit in at least one frame (N,): of x (N, W + 1) to the first poses
+        """Which of the windows ``rows`` (N,) are not far off robust fits in every frame (N,): of x (N, W + 1) to the first poses
         (1 + V F, N, G, 7) and the rest of the first action (N, A - 7 G), with penalties (1 + V F, W + 1).
 
         What is far off in one frame may be as usual in another. To an object that lies askew, a hand goes as it always does
-        in the object's frame, and as it never does in the world's: such windows tell which frame knows."""
-        near, signed = torch.zeros_like(rows), _same_signs(poses)
-        for seen_from, penalty in zip(signed, least, strict=True):
-            target = torch.cat([seen_from.flatten(1), rest], dim=-1)
-            near |= usual_windows(x, target, rows, penalty.diag() + rows.sum() * noise)
+        in the object's frame, and as it never does in the world's: such windows tell which frame knows. A window counts by the
+        frame in which it is the nearest. Distances are the same in all frames, so that one in which all are far excuses none."""
+        x, poses, rest = x[rows], _same_signs(poses[:, rows]), rest[rows]
+        far = [
+            robust_distances(x, torch.cat([pose.flatten(1), rest], dim=-1), penalty.diag() + len(x) * noise)
+            for pose, penalty in zip(poses, least, strict=True)
+        ]
+        near = rows.clone()
+        near[rows] = usual(torch.stack(far).min(0).values)
         return near
 
     def _by_start(self) -> list[Tensor]:

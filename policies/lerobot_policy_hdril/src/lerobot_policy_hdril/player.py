@@ -106,12 +106,12 @@ def advance(policy: Predictor, previous: PlaybackState | None, observed: Tensor)
     if previous is not None and policy.config.rollout == "open_loop":
         state = previous.row()[:, -observed.shape[-1] :]
     choice = policy.choose(state, previous)
-    doubt = torch.zeros_like(choice.begin)
+    doubt = torch.zeros_like(choice.begin, dtype=torch.float32)
     if previous is not None and policy.config.least_survival:
         doubt = _doubt(previous, choice)
     primitive, elapsed, gave_up = _next_primitive(policy, previous, choice, doubt)
     if previous is not None:
-        doubt = doubt * (primitive == previous.primitive)[:, None]
+        doubt = torch.where((primitive == previous.primitive)[:, None], doubt, 0.0)
     probabilities = choice.begin if previous is None else choice.probabilities(previous.primitive)
     recent = state[:, None]
     if previous is not None:
@@ -130,7 +130,7 @@ def advance(policy: Predictor, previous: PlaybackState | None, observed: Tensor)
 def _doubt(previous: PlaybackState, choice: Choice) -> Tensor:
     """(B, K): -log of the probability that the primitive that plays survives all frames since it began, as a sum over what might
     have begun in its place. That it begins again is no doubt."""
-    others = choice.begin.scatter(1, previous.primitive[:, None], 0.0)
+    others = choice.begin.float().scatter(1, previous.primitive[:, None], 0.0)
     hazard = others.sum(-1, keepdim=True).clamp(1e-9, 1.0 - 1e-6)
     return previous.doubt - torch.log1p(-hazard) / hazard * others
 
