@@ -87,12 +87,20 @@ def test_a_primitive_that_begins_again_in_another_form_was_tried_again(gripping)
     policy.select_action(observation(gripping, [0]))
     playback = policy._playback
     assert isinstance(playback, PlaybackState)
-    for form, again in ((1, ("grasp tried again",)), (2, ())):
+    expected = {
+        (1, -1): ("grasp tried again",),
+        (2, -1): (),
+        (2, 0): ("grasp given up",),
+        (1, 0): ("grasp tried again",),
+    }
+    for (form, gave_up), again in expected.items():
         begun = torch.zeros_like(playback.begun)
         begun[0, 0] = begun[0, form] = 1
         begun[0, 0] += form == 0
         policy._playback = PlaybackState(
-            **{**vars(playback), "primitive": torch.tensor([form]), "elapsed": torch.tensor([0]), "begun": begun}
+            **vars(playback)
+            | {"primitive": torch.tensor([form]), "elapsed": torch.tensor([0]), "begun": begun}
+            | {"gave_up": torch.tensor([gave_up])}
         )
         explained = policy.explain()
         assert explained is not None

@@ -143,7 +143,7 @@ def test_the_planner_leaves_something_out_of_episodes_and_of_single_frames(metad
 
 
 def test_the_papers_models_and_once_a_primitive_have_the_plain_planner() -> None:
-    options = ("planner_balance", "planner_dropout", "planner_scale")
+    options = ("planner_balance", "planner_dropout", "planner_scale", "least_survival")
     other = {name for name, values in PRESETS.items() if any(values[option] for option in options)}
     assert other == {"hdril_reactive", "network_reactive"}
 
