@@ -566,6 +566,23 @@ def test_starts_that_few_executions_reach_share_maps_with_the_one_before(late: i
     assert torch.equal(told[1], told[2]) is not alone
 
 
+def test_a_quaternion_of_the_other_sign_is_nothing_unusual() -> None:
+    frames, states = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION).double(), scenes(200, 2)
+    states[:, 10:14] = turned(200, 0.2, generator(4))
+    action = torch.cat([at_cup(states), torch.zeros(200, 1).double()], dim=-1)[:, None]
+    action[..., :3] += 1e-3 * torch.randn(200, 1, 3, generator=generator(5))
+    other = action.clone()
+    other[3::10, :, 3:7] *= -1.0
+    seen, start, mask = states[:, None], torch.zeros(200, dtype=torch.long), torch.ones(200, 1, dtype=torch.bool)
+    noise, fitted = torch.zeros(frames.dim, frames.dim), []
+    for given in (action, other):
+        maps = FusedMaps(frames, 1, 1).double()
+        maps.fit(frames.features(seen), start, frames, seen, given, mask, LEAST, True, noise, SHRINKAGE)
+        fitted.append(maps)
+    for one, same in zip(fitted[0].buffers(), fitted[1].buffers(), strict=True):
+        torch.testing.assert_close(one, same)
+
+
 @pytest.mark.parametrize(("longer", "shown"), [(50, True), (49, False), (1, False), (0, False)])
 def test_a_step_that_few_windows_reach_is_as_the_one_before(longer: int, shown: bool) -> None:
     frames = ObjectFrames(STATE, [*CUP, *SHELF, "cup.size"], ACTION).double()
