@@ -34,6 +34,7 @@ def markdown(results: Mapping[str, Any], pictures: Sequence[Sequence[str]] = ())
         blocks += [
             f"## {table['title']}",
             *([table["note"]] if table["note"] else []),
+            _data(table),
             _seeds(table),
             _made(table["made"]),
             _rows(table),
@@ -42,6 +43,15 @@ def markdown(results: Mapping[str, Any], pictures: Sequence[Sequence[str]] = ())
         blocks += [*_tests(table), *_falls(table)]
     blocks += ["## Commands", *_commands(results)]
     return "\n\n".join(blocks) + "\n"
+
+
+def _data(table: Mapping[str, Any]) -> str:
+    told = [
+        f"`{name}`: {spec['episodes']} of `{spec['task']}`, seeds from {spec['seed']} on"
+        + "".join(f", `--{noise}={spec[noise]:g}`" for noise in ("perturb", "stray") if spec[noise])
+        for name, spec in table["data"].items()
+    ]
+    return f"Demonstrations of the scripted expert: {'; '.join(told)}."
 
 
 def _seeds(table: Mapping[str, Any]) -> str:
@@ -180,13 +190,14 @@ def _both_minutes(table: Mapping[str, Any], test: Mapping[str, Any] | None) -> l
 
 
 def _commands(results: Mapping[str, Any]) -> list[str]:
-    """The commands under the numbers, once each; ``STORE`` stands for the folder of the results."""
+    """The commands under the numbers, once each, and what stands for the folder of the results in them."""
     found: dict[str, None] = {}
     for table in results["tables"]:
         for row in table["rows"]:
             found |= dict.fromkeys(row["training_commands"])
             found |= dict.fromkeys(run["command"] for runs in row["cells"].values() for run in runs)
-    return ["```\n" + "\n".join(re.sub(_LISTED, _first_of, command) for command in found) + "\n```"]
+    told = "`STORE` is the folder of all results, `outputs/benchmark/store` unless `--store` names another."
+    return [told, "```\n" + "\n".join(re.sub(_LISTED, _first_of, command) for command in found) + "\n```"]
 
 
 def _first_of(listed: re.Match[str]) -> str:

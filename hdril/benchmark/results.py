@@ -66,8 +66,13 @@ def keep_tables(matrix: Matrix, results: dict[str, Any], before: Mapping[str, An
                 "note": spec.note,
                 "published": spec.published,
                 "published_by": spec.published_by,
+                "data": _data(matrix, spec),
             }
     return results | {"tables": [found[title] for title in specs if title in found]}
+
+
+def _data(matrix: Matrix, table: TableSpec) -> dict[str, Any]:
+    return {name: vars(matrix.data[name]) for name in table.data}
 
 
 def _asked(matrix: Matrix, table: TableSpec) -> str:
@@ -104,6 +109,7 @@ def _table(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
     return {
         "title": table.title,
         "note": table.note,
+        "data": _data(matrix, table),
         "evaluations": {name: vars(matrix.evaluations[name]) for name in table.evaluations},
         "training_seeds": table.training_seeds,
         "rows": found,

@@ -803,6 +803,7 @@ def test_a_report_grows_table_by_table(tmp_path: Path) -> None:
     text = (tmp_path / "report.md").read_text()
     assert text.count("Its steps took 0.33 hours, each with one thread, on a machine.") == 2
     assert "Evaluated with hdril 0." in text
+    assert "Demonstrations of the scripted expert: `nominal`: 50 of `table_lift`, seeds from 0 on." in text
 
     def word(values: dict[str, Any]) -> None:
         two_tables(values)
