@@ -5,6 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from math import inf
+from pathlib import Path
+from typing import Any
+
+import yaml
 
 from hdril.benchmark.matrix import BESIDE, DataSpec, EvaluationSpec, Matrix, PolicySpec, TableSpec, training
 from hdril.benchmark.page import slug
@@ -15,18 +19,21 @@ from hdril.evaluation.identity import identify_trials
 from hdril.files import MAX_SEED
 from hdril.tasks import base_name, built_as, get_task
 
+_DECIDED = ("resume", "dataset.episodes", "dataset.eval_split", "policy.path", "policy.pretrained_path")
+"""What a training may learn from besides its demonstrations, or which of them it leaves out: not even a config file may say."""
 _OF_TRAINING = (
-    "config_path", "dataset.root", "dataset.repo_id", "dataset.episodes", "output_dir", "steps", "save_freq", "seed", "resume",
-    "policy.path", "policy.pretrained_path",
+    "config_path", "dataset", "dataset.root", "dataset.repo_id", "output_dir", "policy", "steps", "save_freq", "seed", *_DECIDED,
 )  # fmt: skip
 _OF_EVALUATION = (
-    "config_path", "policy.path", "task", "num_episodes", "seed", "rerun", "workers", "output_dir", "against", "suite", "cells",
-    "push", "shards", "shard", "executor",
+    "config_path", "policy", "policy.path", "task", "num_episodes", "seed", "rerun", "workers", "output_dir", "against", "suite",
+    "cells", "push", "shards", "shard", "executor", "training_data",
 )  # fmt: skip
 """What the benchmark sets by itself, so that the matrix says what was done; or what it cannot keep track of."""
 _FRAMES, _MISHAP = "max_frames", "mishap"
 
 
+_ANY_TASK = "all"
+"""In a file of used seeds."""
 _LONGEST = 80
 """Letters of a title that names files."""
 
@@ -52,8 +59,9 @@ def check(matrix: Matrix) -> None:
         if not policy.config.exists():
             raise FileNotFoundError(f"policy {name}: there is no config file {policy.config}")
         _check_budget(name, policy)
+        _check_config(name, policy.config)
         _check_options(f"policy {name}", policy.options, _OF_TRAINING)
-        training(matrix, name, Record("table_lift", 1), 1, 0.0, 0).settings()  # what it needs is there
+        training(matrix, name, Record("table_lift", 1), 0.0, 0).settings()  # what it needs is there
     for name, evaluation in matrix.evaluations.items():
         get_task(evaluation.task)
         _check_seeds(f"evaluation {name}", evaluation.seed, evaluation.episodes)
@@ -71,6 +79,8 @@ def check(matrix: Matrix) -> None:
         table.title for table, name in zip(matrix.tables, titles, strict=True) if not 1 <= len(name) <= _LONGEST
     ]:
         raise ValueError(f"a title names files: it needs 1 to {_LONGEST} letters and digits, got {unfit[0]!r}")
+    if unfit := [table.title for table in matrix.tables if set("[]") & set(table.title)]:
+        raise ValueError(f"a title must be without brackets, got {unfit[0]!r}")
     if alike := [table.title for table in matrix.tables if titles.count(slug(table.title)) > 1]:
         raise ValueError(
             f"tables need titles that differ in letters or digits; alike are {' and '.join(map(repr, alike))}"
@@ -85,6 +95,18 @@ def _check_budget(name: str, policy: PolicySpec) -> None:
         )
     if wrong := [minutes for minutes in policy.minutes if not 0.0 < minutes < inf or policy.minutes.count(minutes) > 1]:
         raise ValueError(f"policy {name}: minutes must be above 0 and differ, got {wrong[0]:g}")
+
+
+def _check_config(name: str, path: Path) -> None:
+    """Raises ValueError if a config file of lerobot-train says what the benchmark decides."""
+    told = yaml.safe_load(path.read_text())
+    if not isinstance(told, dict):
+        raise ValueError(f"policy {name}: {path} holds no options")
+    for option in _DECIDED:
+        group, _, key = option.rpartition(".")
+        values = told.get(group) if group else told
+        if isinstance(values, dict) and values.get(key):
+            raise ValueError(f"policy {name}: {path} must not say {option}")
 
 
 def _check_options(what: str, options: list[str], known: tuple[str, ...]) -> None:
@@ -188,10 +210,11 @@ def _check_table(matrix: Matrix, table: TableSpec) -> None:
             )
     for name in table.data:
         most = matrix.data[name].episodes
+        shown = max(table.demonstrations or [most])
         if wrong := [count for count in table.demonstrations if not 1 <= count <= most]:
             raise ValueError(f"table {table.title!r}: data {name} has 1 to {most} demonstrations, got {wrong[0]}")
-        if not 0 <= table.trajectories <= most:
-            raise ValueError(f"table {table.title!r}: trajectories must be from 0 to {most}, got {table.trajectories}")
+        if not 0 <= table.trajectories <= shown:
+            raise ValueError(f"table {table.title!r}: trajectories must be from 0 to {shown}, got {table.trajectories}")
         task = base_name(matrix.data[name].task)
         if other := [key for key in table.evaluations if base_name(matrix.evaluations[key].task) != task]:
             raise ValueError(f"table {table.title!r}: evaluation {other[0]} is not of {task}, the task of data {name}")
@@ -213,12 +236,13 @@ def check_held_out(matrix: Matrix) -> None:
     used = [
         *((f"data {name}", base_name(spec.task), _seeds(spec)) for name, spec in matrix.data.items()),
         *((f"tuning on {name}", base_name(e.task), _seeds(e)) for name, e in matrix.evaluations.items() if e.tuning),
+        *_used_before(matrix.used_seeds),
     ]
     for name, evaluation in matrix.evaluations.items():
         seeds, task = _seeds(evaluation), base_name(evaluation.task)
         for use, other, theirs in used[: len(matrix.data)] if evaluation.tuning else used:
             common = range(max(seeds.start, theirs.start), min(seeds.stop, theirs.stop))
-            if other == task and common:
+            if other in (task, _ANY_TASK) and common:
                 raise ValueError(
                     f"evaluation {name} is not held out: {use} has its seeds {common.start} to {common[-1]} of {task}, too"
                 )
@@ -232,6 +256,24 @@ def check_held_out(matrix: Matrix) -> None:
                 raise ValueError(
                     f"table {table.title!r}: the matrix is for tuning, and so must be {name} (tuning: true)"
                 )
+
+
+def _used_before(path: Path | None) -> list[tuple[str, str, range]]:
+    """Seeds in a file by which choices were made: what for, of which task, and which.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it holds something else.
+    """
+    if path is None:
+        return []
+    entries: Any = yaml.safe_load(path.read_text())
+    try:
+        return [
+            (f"{path} ({entry['why']})", entry["task"], range(entry["first"], entry["last"] + 1)) for entry in entries
+        ]
+    except (KeyError, TypeError):
+        raise ValueError(f"{path} must be a list of entries with task, first, last and why") from None
 
 
 def _seeds(spec: DataSpec | EvaluationSpec) -> range:

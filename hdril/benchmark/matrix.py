@@ -89,6 +89,9 @@ class TableSpec:
     """Seeds of weights and batches, one training each."""
     against: str = ""
     """The policy that the others are compared with, on the same demonstrations and seeds."""
+    margin: float = 0.0
+    """Points by which success may fall where something happens: the table says of each evaluation that has a control whether it
+    falls by no more. 0: it does not say."""
     beside: list[str] = field(default_factory=list)
     """What is shown beside success: errors against the expert (position_error_cm, angle_error_rad, dtw_cm), how often the policy
     begins with the expert's primitive (pc_expert_choice), and its hands' jerk against the expert's (jerk_to_expert)."""
@@ -121,6 +124,9 @@ class Matrix:
     """What is reported."""
     tuning: bool = False
     """Whether choices are made by the results. The report then says so, and every evaluation must be for tuning."""
+    used_seeds: Path | None = None
+    """A YAML file of seeds by which choices were made before, a list of {task, first, last, why}. What is reported may not have
+    them."""
 
 
 @dataclass(frozen=True)
@@ -144,21 +150,22 @@ def rows(matrix: Matrix, table: TableSpec) -> Iterator[Row]:
     """The rows of a table, with the steps that fill them."""
     for name in table.data:
         spec = matrix.data[name]
-        record = Record(spec.task, spec.episodes, spec.seed, spec.perturb, spec.stray)
         for count in table.demonstrations or [spec.episodes]:
+            # A data set of its own: policies learn from statistics and names of the whole data set, too.
+            record = Record(spec.task, count, spec.seed, spec.perturb, spec.stray)
             for policy in table.policies:
                 for minutes in matrix.policies[policy].minutes or [0.0]:
-                    trained = [training(matrix, policy, record, count, minutes, seed) for seed in table.training_seeds]
+                    trained = [training(matrix, policy, record, minutes, seed) for seed in table.training_seeds]
                     evaluations = {
                         key: tuple(_evaluate(matrix, key, train) for train in trained) for key in table.evaluations
                     }
                     yield Row(name, policy, count, minutes or None, evaluations)
 
 
-def training(matrix: Matrix, name: str, data: Record, episodes: int, minutes: float, seed: int) -> Train:
-    """The step that trains a policy of the matrix on the first ``episodes`` of ``data``, for ``minutes`` unless they are 0."""
+def training(matrix: Matrix, name: str, data: Record, minutes: float, seed: int) -> Train:
+    """The step that trains a policy of the matrix on ``data``, for ``minutes`` unless they are 0."""
     spec = matrix.policies[name]
-    return Train(name, data, episodes, spec.config, tuple(spec.options), spec.steps, seed, minutes, spec.in_memory)
+    return Train(name, data, spec.config, tuple(spec.options), spec.steps, seed, minutes, spec.in_memory)
 
 
 def _evaluate(matrix: Matrix, name: str, policy: Train) -> Evaluate:

@@ -52,7 +52,7 @@ def write_report(document: Path, results: Mapping[str, Any]) -> list[Path]:
 
 def slug(title: str) -> str:
     """A title as a part of file names."""
-    return re.sub(r"\W+", "_", title.lower()).strip("_")
+    return re.sub(r"\W+", "_", title.lower(), flags=re.ASCII).strip("_")
 
 
 def _picture(figure: Figure, kind: str) -> bytes:

@@ -6,6 +6,7 @@ gone: a command that went on would write beside the one that is started next.
 
 from __future__ import annotations
 
+import fcntl
 import os
 import pickle
 import shlex
@@ -14,19 +15,24 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 from typing import Any
 
 from hdril.benchmark.steps import Folders, Step
 from hdril.benchmark.store import DONE, LOG, RESULT, is_done, mark_done
 from hdril.digest import digest_json
-from hdril.files import BusyError, exclusively
+from hdril.files import BusyError, exclusively, write_atomically
 
 BUSY = os.EX_TEMPFAIL
 """Exit code if another process does the step."""
+SPENT, RUNNING = "spent.txt", "running.lock"
+"""Beside a result: how long a step has taken so far, s; and what its command holds as long as it runs."""
+TICK = 1.0
+"""s."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +66,7 @@ def perform(assignment: Assignment) -> int:
         OSError, ValueError: the command succeeded, but its result is not whole; or what decides it was edited meanwhile.
     """
     step, place = assignment.step, assignment.place
-    with exclusively(place, f"doing {step.title}"):
+    with exclusively(place, f"doing {step.title}"), _alone(place / RUNNING) as running:
         if is_done(place):
             return 0
         (place / DONE).unlink(missing_ok=True)  # somebody deleted the result
@@ -69,13 +75,56 @@ def perform(assignment: Assignment) -> int:
         if not step.resumes:
             shutil.rmtree(output, ignore_errors=True)
         command = step.command(output, assignment.inputs)
-        begun = time.monotonic()
         # A result without step.json is whole if the process was killed between the two: the command would refuse it.
-        code = 0 if step.resumes and output.exists() else _run(command, place / LOG)
+        with _stopwatch(place / SPENT, goes_on=step.resumes) as spent:
+            code = 0 if step.resumes and output.exists() else _run(command, place / LOG, running)
         if code == 0:
             _check_unchanged(assignment)
-            mark_done(place, step, assignment.made_from, shlex.join(command), time.monotonic() - begun)
+            mark_done(place, step, assignment.made_from, shlex.join(command), spent())
+            (place / SPENT).unlink()
         return code if code != BUSY else 1
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[int]:
+    """A lock for the command to hold as well, by its file descriptor: the command goes on if this process alone is killed.
+
+    Raises:
+        BusyError: it does.
+    """
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise BusyError(f"a command in {path.parent} outlived the process that started it; wait for it") from None
+        yield file.fileno()
+
+
+@contextmanager
+def _stopwatch(file: Path, goes_on: bool) -> Iterator[Callable[[], float]]:
+    """Seconds spent, with those of former attempts if the command goes on where it was. They are on disk at most
+    :data:`TICK` seconds late, because a process that is killed cannot write them."""
+    before = float(file.read_text()) if goes_on and file.exists() else 0.0
+    begun, over = time.monotonic(), Event()
+
+    def spent() -> float:
+        return before + time.monotonic() - begun
+
+    def write() -> None:
+        write_atomically(file, lambda stream: stream.write(f"{spent():.1f}".encode()))
+
+    def keep() -> None:
+        while not over.wait(TICK):
+            write()
+
+    thread = Thread(target=keep, daemon=True)
+    thread.start()
+    try:
+        yield spent
+    finally:
+        over.set()
+        thread.join()
+        write()
 
 
 def _check_unchanged(assignment: Assignment) -> None:
@@ -89,8 +138,9 @@ def _check_unchanged(assignment: Assignment) -> None:
         raise ValueError(f"{changed} changed while the benchmark ran: start it again")
 
 
-def _run(command: list[str], log: Path) -> int:
-    """Run a command, its output into the log, until it ends or the process that started this one is gone."""
+def _run(command: list[str], log: Path, running: int) -> int:
+    """Run a command, its output into the log, until it ends or the process that started this one is gone. The descriptor
+    ``running`` stays open in it."""
     # The matrices are small: a second thread slows training down, and another step has the other processor.
     variables = os.environ | {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "HDRIL_DEBUG": "1"}
     # The programs of this environment, for what the command starts by name as well.
@@ -99,8 +149,9 @@ def _run(command: list[str], log: Path) -> int:
         file.write(f"$ {shlex.join(command)}\n".encode())
         file.flush()
         process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=file, stderr=file, env=variables, start_new_session=True
-        )
+            command, stdin=subprocess.DEVNULL, stdout=file, stderr=file, env=variables, start_new_session=True,
+            pass_fds=[running],
+        )  # fmt: skip
     Thread(target=_end_with_parent, args=(process,), daemon=True).start()
     return process.wait()
 

@@ -19,22 +19,24 @@ from hdril.demonstrations.read import read_episode
 from hdril.digest import SHORT, digest_file, digest_json
 from hdril.evaluation.checkpoint import read_json
 from hdril.evaluation.statistics import (
-    bootstrap_difference,
+    difference_over_trainings,
     holm,
     mcnemar_exact,
     paired_counts,
-    paired_difference_interval,
+    wilson_interval,
 )
 from hdril.evaluation.stored import read_evaluation
 
-_KEPT = ("n_episodes", "n_success", "pc_success", "pc_success_ci95", "held_out", "position_error_cm", "angle_error_rad",
-         "dtw_cm", "pc_expert_choice", "jerk_to_expert", "n_expert_failures", "stages_reached")  # fmt: skip
+_KEPT = ("n_episodes", "n_success", "pc_success", "held_out", "position_error_cm", "angle_error_rad", "dtw_cm",
+          "pc_expert_choice", "jerk_to_expert", "n_expert_failures", "stages_reached")  # fmt: skip
 
 
+SIGNIFICANCE = 0.05
+"""Family-wise error of a list of tests."""
 _SHAPE = 3
 """Of a table as data. It counts up when the report needs what older tables do not have: they are not kept then."""
 
-_LATER = {"stray": 0.0}
+_LATER = {"stray": 0.0, "margin": 0.0}
 """Options that came later than reports which are kept. A definition that does not use them asks for what it asked for before."""
 
 
@@ -77,16 +79,20 @@ def _data(matrix: Matrix, table: TableSpec) -> dict[str, Any]:
 
 def _asked(matrix: Matrix, table: TableSpec) -> str:
     """Digest of the definition of a table, its texts aside: what it names, and how that is defined."""
-    wordless = replace(table, note="", published={}, published_by="")
+    wordless = _without_later(asdict(replace(table, note="", published={}, published_by="")))
     policies = [
         asdict(spec) | {"config": digest_file(spec.config)}
         for spec in (matrix.policies[name] for name in table.policies)
     ]
     data, evaluations = (
-        [{key: value for key, value in asdict(known[name]).items() if _LATER.get(key) != value} for name in names]
+        [_without_later(asdict(known[name])) for name in names]
         for names, known in ((table.data, matrix.data), (table.evaluations, matrix.evaluations))
     )
-    return digest_json([_SHAPE, asdict(wordless), data, policies, evaluations])[:SHORT]
+    return digest_json([_SHAPE, wordless, data, policies, evaluations])[:SHORT]
+
+
+def _without_later(definition: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in definition.items() if _LATER.get(key) != value}
 
 
 def _made(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
@@ -98,6 +104,7 @@ def _made(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
         "asked": _asked(matrix, table),
         "software": {name: version for each in made_from for name, version in each["settings"]["software"].items()},
         "machines": sorted({each.machine for each in done}),
+        "commits": sorted({each.commit for each in done} - {""}),
         "hours": round(sum(each.seconds for each in done) / 3600.0, 2),
     }
 
@@ -105,7 +112,7 @@ def _made(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
 def _table(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
     wanted = list(rows(matrix, table))
     found = [_row(row, store) for row in wanted]
-    recorded = {row.data: row.trainings[0].data for row in wanted}
+    recorded = {row.data: row.trainings[0].data for row in sorted(wanted, key=lambda row: row.demonstrations)}
     return {
         "title": table.title,
         "note": table.note,
@@ -146,12 +153,22 @@ def _row(row: Row, store: Store) -> dict[str, Any]:
 
 
 def _run(step: Evaluate, store: Store) -> dict[str, Any]:
-    """One evaluation: its numbers, what was evaluated, and the command. ``failed_seeds`` lets a reader pair two policies."""
+    """One evaluation: its numbers, what was evaluated, and the command. ``failed_seeds`` lets a reader pair two policies.
+
+    Raises:
+        ValueError: it holds other seeds than were asked for, or seeds that are not known to be held out.
+    """
     done = store.get(step)
     results = read_evaluation(done.output).results
     if [episode["seed"] for episode in results["per_episode"]] != list(step.seeds):
         raise ValueError(f"{done.output} holds other seeds than {step.title} asks for")
+    if results["held_out"] is not True:
+        raise ValueError(
+            f"{done.output} is no evaluation on held-out seeds: {results['held_out_basis'] or 'that was not checked'}"
+        )
+    interval = wilson_interval(results["n_success"], results["n_episodes"])
     return {key: results[key] for key in _KEPT} | {
+        "pc_success_ci95": [100.0 * bound for bound in interval],
         "training_seed": step.policy.seed,
         "weights": results["identity"]["policy"]["weights"],
         "failed_seeds": [episode["seed"] for episode in results["per_episode"] if not episode["success"]],
@@ -176,7 +193,7 @@ def _tests(matrix: Matrix, table: TableSpec, found: Sequence[Mapping[str, Any]])
         base = _base(table, found, row)
         first, second = (_outcomes(entry["cells"][name], matrix.evaluations[name]) for entry in (row, base))
         named = _named(row) | {"against_minutes": base["minutes"], "evaluation": name}
-        tests.append(named | _compare(first, second))
+        tests.append(named | _compare(first, second, same_trainings=False))
     return _adjusted(tests)
 
 
@@ -187,8 +204,17 @@ def _falls(matrix: Matrix, table: TableSpec, found: Sequence[Mapping[str, Any]])
         if not (control := matrix.evaluations[name].control):
             continue
         first, second = (_outcomes(row["cells"][key], matrix.evaluations[key]) for key in (name, control))
-        falls.append(_named(row) | {"evaluation": name, "control": control} | _compare(first, second))
+        fall = _named(row) | {"evaluation": name, "control": control} | _compare(first, second, same_trainings=True)
+        falls.append(fall | _within(fall["pc_difference_ci95"], table.margin))
     return _adjusted(falls)
+
+
+def _within(interval: Sequence[float], margin: float) -> dict[str, Any]:
+    """Whether success falls by no more than ``margin`` points, as far as the interval of the difference tells."""
+    if not margin:
+        return {}
+    low, high = interval
+    return {"margin": margin, "within": "yes" if low >= -margin else "no" if high < -margin else "not shown"}
 
 
 def _named(row: Mapping[str, Any]) -> dict[str, Any]:
@@ -197,10 +223,18 @@ def _named(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _adjusted(tests: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The tests, each with its p-values adjusted for all of them."""
+    """The tests, each with its p-values adjusted for all of them, and whether they show a difference.
+
+    They do if every pair of trainings differs, all in the same direction, and the interval of the difference is on one side of 0.
+    """
     adjusted = iter(holm([p for test in tests for p in test["p_values"]]))
     for test in tests:
         test["p_values_holm"] = [next(adjusted) for _ in test["p_values"]]
+        low, high = test["pc_difference_ci95"]
+        one_side = any(
+            all(sign * value > 0.0 for value in (*test["pc_differences"], low, high)) for sign in (1.0, -1.0)
+        )
+        test["differs"] = one_side and max(test["p_values_holm"]) < SIGNIFICANCE
     return tests
 
 
@@ -215,21 +249,23 @@ def _base(table: TableSpec, found: Sequence[Mapping[str, Any]], row: Mapping[str
     return max(same or bases, key=lambda other: other["minutes"] or 0.0)
 
 
-def _compare(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> dict[str, Any]:
-    """The difference in success with its interval, and p of each pair of trainings with the same seed.
+def _compare(first: NDArray[np.bool_], second: NDArray[np.bool_], same_trainings: bool) -> dict[str, Any]:
+    """The difference in success with its interval, and difference and p of each pair of trainings with the same seed.
 
     Args:
         first: (trainings, seeds) outcomes.
         second: (trainings, seeds) outcomes.
+        same_trainings: both are of the same trained policies.
     """
     pairs = [
         paired_counts(dict(enumerate(a)), dict(enumerate(b)))
         for a, b in zip(first.tolist(), second.tolist(), strict=True)
     ]
-    alone = len(pairs) == 1
-    low, high = paired_difference_interval(pairs[0]) if alone else bootstrap_difference(first, second)
     return {
         "pc_difference": 100.0 * float(first.mean() - second.mean()),
-        "pc_difference_ci95": [100.0 * low, 100.0 * high],
+        "pc_difference_ci95": [
+            100.0 * bound for bound in difference_over_trainings(first, second, same_trainings=same_trainings)
+        ],
+        "pc_differences": [100.0 * counts.difference for counts in pairs],
         "p_values": [mcnemar_exact(counts) for counts in pairs],
     }

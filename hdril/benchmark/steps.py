@@ -34,6 +34,12 @@ Folders = Mapping[str, Path]
 """Results of a step's inputs, by the names of the inputs."""
 ENDLESS = 10**9
 """Steps of a training that is stopped when its speed is known."""
+_EVALUATED = (
+    "cli/eval.py",
+    *(f"evaluation/{name}.py" for name in (
+        "checkpoint", "held_out", "identity", "observation", "overrides", "results")),
+)  # fmt: skip
+"""Sources that decide what hdril-eval plays and writes, besides those that decide scenes and scores."""
 
 
 class Step(ABC):
@@ -106,7 +112,7 @@ class Record(Step):
 
 @dataclass(frozen=True)
 class Train(Step):
-    """Stock ``lerobot-train`` with a config file, on the first ``episodes`` demonstrations.
+    """Stock ``lerobot-train`` with a config file.
 
     It trains ``steps``, or as many steps as the command does in ``minutes`` on one core, its start included. LeRobot's schedules
     depend on the number of steps, so that it is worked out before, from the speed.
@@ -115,7 +121,6 @@ class Train(Step):
     name: str
     """Of the policy, for people; it decides nothing."""
     data: Record
-    episodes: int
     config: Path
     options: tuple[str, ...]
     steps: int
@@ -133,7 +138,7 @@ class Train(Step):
     @property
     def title(self) -> str:
         budget = f", {self.minutes:g} minutes" if self.minutes else ""
-        return f"{self.name} on {self.episodes} of {self.data.task}{budget}, seed {self.seed}"
+        return f"{self.name} on {self.data.episodes} of {self.data.task}{budget}, seed {self.seed}"
 
     @property
     def inputs(self) -> Mapping[str, Step]:
@@ -168,7 +173,7 @@ class Train(Step):
             "config": digest_file(self.config),
             "options": list(self.options),
             "device": self._decided("device"),  # unless told, LeRobot takes what the machine has
-            "episodes": self.episodes,
+            "episodes": self.data.episodes,
             **({"minutes": self.minutes, "calibration": _calibration()} if self.minutes else {"steps": self.steps}),
             **({"in_memory": _in_memory_software()} if self.in_memory else {}),
             "seed": self.seed,
@@ -177,10 +182,9 @@ class Train(Step):
 
     def command(self, output: Path, inputs: Folders) -> list[str]:
         steps = self.count_steps(inputs)
-        subset = [] if self.episodes == self.data.episodes else [f"--dataset.episodes={list(range(self.episodes))}"]
         program = ["python", "-m", "lerobot_policy_hdril.in_memory"] if self.in_memory else ["lerobot-train"]
         return [*program, f"--config_path={self.config}", "--dataset.repo_id=local/benchmark",
-                f"--dataset.root={inputs['data']}", *subset, f"--output_dir={output}", f"--steps={steps}",
+                f"--dataset.root={inputs['data']}", f"--output_dir={output}", f"--steps={steps}",
                 f"--save_freq={steps}", f"--seed={self.seed}", *self.options]  # fmt: skip
 
     def checkpoint(self, output: Path) -> Path:
@@ -241,7 +245,7 @@ class Calibrate(Step):
 
     @property
     def title(self) -> str:
-        return f"speed of {self.training.name} on {self.training.episodes} of {self.training.data.task}"
+        return f"speed of {self.training.name} on {self.training.data.episodes} of {self.training.data.task}"
 
     @property
     def inputs(self) -> Mapping[str, Step]:
@@ -289,7 +293,7 @@ class Evaluate(Step):
     def settings(self) -> dict[str, Any]:
         trials = {"task": self.task, "episodes": self.episodes, "first_seed": self.first_seed}
         software = evaluation_software(base_name(self.task)) | _training_software(self.policy.policy_type)
-        software |= {"hdril.evaluation.results": source_software("evaluation/results.py")["hdril"]}
+        software |= {"hdril-eval": source_software(*_EVALUATED)["hdril"]}
         return trials | {"options": list(self.options), "software": software}
 
     def command(self, output: Path, inputs: Folders) -> list[str]:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import os
 import platform
+import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import hdril
 from hdril.benchmark.steps import Step
 from hdril.digest import SHORT, digest_json
+from hdril.evaluation.checkpoint import read_json
 from hdril.files import write_atomically
 
 RESULT, DONE, LOG = "result", "step.json", "log.txt"
@@ -27,6 +30,8 @@ class Done:
     command: str
     machine: str = ""
     """What did it."""
+    commit: str = ""
+    """Of the checkout that it was done from, with a + if files were edited; empty if there is none."""
 
 
 class Store:
@@ -48,10 +53,15 @@ class Store:
             place = self.place(step)
             if place is None or not is_done(place):
                 return None
-            told = json.loads((place / DONE).read_text())
+            told = read_json(place / DONE)
             self._done[step] = Done(
-                place / RESULT, told["digest"], told["seconds"], told["command"], told["machine"]
-            )  # fmt: skip
+                place / RESULT,
+                told["digest"],
+                told["seconds"],
+                told["command"],
+                told["machine"],
+                told.get("commit", ""),
+            )
         return self._done[step]
 
     def place(self, step: Step) -> Path | None:
@@ -103,10 +113,33 @@ def mark_done(place: Path, step: Step, made_from: Mapping[str, Any], command: st
         OSError, ValueError: it is not.
     """
     told = {"title": step.title, "digest": step.digest(place / RESULT), "seconds": round(seconds, 1),
-            "command": command, "machine": _machine(), "made_from": made_from}  # fmt: skip
+            "command": command, "machine": _machine(), "commit": _commit(), "made_from": made_from}  # fmt: skip
     write_atomically(place / DONE, lambda file: file.write(json.dumps(told, indent=1).encode()))
 
 
 def _machine() -> str:
     """The kind of this machine, without its name."""
-    return f"{platform.machine()}, {platform.system()}, {os.cpu_count()} cores"
+    return f"{platform.machine()}, {platform.system()}, {os.cpu_count()} cores, {_processor()}"
+
+
+def _processor() -> str:
+    """The model of the processor, as far as it is told."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or "unknown"
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or "unknown"
+
+
+def _commit() -> str:
+    """See :attr:`Done.commit`."""
+    git = ["git", "-C", str(Path(hdril.__file__).parent)]
+    try:
+        found = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
+        edited = subprocess.run(
+            [*git, "diff", "--quiet", "HEAD", "--", ":/"], capture_output=True, check=False
+        ).returncode
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return found.stdout.strip() + ("+" if edited else "")

@@ -116,7 +116,11 @@ def _correlation(counts: PairedCounts) -> float:
 
 
 def bootstrap_difference(
-    first: NDArray[np.bool_], second: NDArray[np.bool_], confidence: float = 0.95, resamples: int = 10_000
+    first: NDArray[np.bool_],
+    second: NDArray[np.bool_],
+    confidence: float = 0.95,
+    resamples: int = 10_000,
+    same_trainings: bool = False,
 ) -> tuple[float, float]:
     """Percentile interval for the difference of two mean success rates over trainings and seeds, in [-1, 1].
 
@@ -129,21 +133,50 @@ def bootstrap_difference(
         second: (trainings, seeds) outcomes on the same seeds; the number of trainings may be another.
         confidence: of the interval.
         resamples: how many; the random numbers are always the same.
+        same_trainings: both are of the same trained policies, in the same order, and these are drawn for both at once.
 
     Raises:
-        ValueError: no outcomes, or the seeds differ in number.
+        ValueError: no outcomes, or the seeds differ in number, or the trainings do where they are the same.
     """
     if first.size == 0 or second.size == 0 or first.shape[1] != second.shape[1]:
         raise ValueError(f"paired outcomes need trainings and the same seeds, got {first.shape} and {second.shape}")
+    if same_trainings and len(first) != len(second):
+        raise ValueError(f"the same trainings must be as many, got {len(first)} and {len(second)}")
     rng, seeds = np.random.default_rng(0), first.shape[1]
 
     def shares(count: int) -> NDArray[np.float64]:
         return rng.multinomial(count, np.full(count, 1.0 / count), resamples) / count
 
-    by_seed = shares(len(first)) @ first - shares(len(second)) @ second
+    if same_trainings:
+        by_seed = shares(len(first)) @ (first.astype(np.float64) - second)
+    else:
+        by_seed = shares(len(first)) @ first - shares(len(second)) @ second
     differences = (by_seed * shares(seeds)).sum(axis=1)
     low, high = np.quantile(differences, [(1.0 - confidence) / 2.0, (1.0 + confidence) / 2.0]).tolist()
     return low, high
+
+
+def difference_over_trainings(
+    first: NDArray[np.bool_], second: NDArray[np.bool_], confidence: float = 0.95, same_trainings: bool = False
+) -> tuple[float, float]:
+    """Interval for the difference of two mean success rates, in [-1, 1], from as many trainings of each policy.
+
+    One training has that of :func:`paired_difference_interval`. Several have that of :func:`bootstrap_difference`, at least as
+    wide as the mean one of the pairs of trainings: where all succeed on all seeds, the bootstrap is a single number, although so
+    many seeds leave a difference of some points open. The arguments are those of :func:`bootstrap_difference`.
+
+    Raises:
+        ValueError: no outcomes, or the seeds or the trainings differ in number.
+    """
+    pairs = [
+        paired_counts(dict(enumerate(a)), dict(enumerate(b)))
+        for a, b in zip(first.tolist(), second.tolist(), strict=True)
+    ]
+    low, high = np.mean([paired_difference_interval(counts, confidence) for counts in pairs], axis=0).tolist()
+    if len(pairs) == 1:
+        return low, high
+    lower, upper = bootstrap_difference(first, second, confidence, same_trainings=same_trainings)
+    return min(low, lower), max(high, upper)
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -11,7 +11,7 @@ from typing import Any
 from hdril.benchmark.steps import Folders, Step
 
 PROGRAM = """
-import sys, time
+import os, sys, time
 from pathlib import Path
 text, pause, count, output, *inputs = sys.argv[1:]
 with Path(count).open("a") as file:
@@ -22,6 +22,7 @@ output.mkdir(parents=True)
 time.sleep(float(pause))
 if text.startswith("broken"):
     sys.exit("this step cannot be done")
+(output / "threads").write_text(os.environ["OMP_NUM_THREADS"] + os.environ["MKL_NUM_THREADS"])
 (output / "text").write_text("(" + " ".join(parts) + ")")
 """
 

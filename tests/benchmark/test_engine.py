@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import Counter
 from contextlib import suppress
@@ -109,16 +111,40 @@ def test_a_step_that_fails_keeps_back_what_is_made_from_it_alone(store: Store, c
 
 
 def test_as_many_at_a_time_as_allowed(store: Store, count: Path) -> None:
-    """Six steps of half a second, three at a time: faster than one after the other, and never more than three."""
-    steps = [Words(f"step{i}", count, pause=0.5) for i in range(6)]
-    most = 0
+    """Six steps of a second, three at a time: faster than one after the other, and never more than three."""
+    steps = [Words(f"step{i}", count, pause=1.0) for i in range(6)]
+    seen, over = [0], threading.Event()
 
-    def watch(step: Step, progress: Progress) -> None:
-        nonlocal most
-        most = max(most, sum(begun(count).values()) - 6 + progress.left["words"] + 1)
+    def look() -> None:
+        while not over.wait(0.02):
+            seen.append(len(alive(store.folder)))
 
-    Engine(store, 3, watch).run(steps)
-    assert 1 < most <= 3 + 1  # a step is told of a moment after it is done, when the next one may have begun
+    looking = threading.Thread(target=look)
+    looking.start()
+    try:
+        Engine(store, 3).run(steps)
+    finally:
+        over.set()
+        looking.join()
+    assert 1 < max(seen) <= 3
+
+
+def test_what_is_left_is_shared_by_the_jobs() -> None:
+    progress = Progress(
+        2, seconds={"train": [90.0, 110.0], "record": [10.0]}, left={"train": 3, "record": 2, "play": 0}
+    )
+    assert progress.remaining() == pytest.approx((3 * 100.0 + 2 * 10.0) / 2)
+    progress.left["evaluate"] = 1
+    assert progress.remaining() is None, "nothing is known of evaluations"
+
+
+def test_a_step_has_one_thread_and_says_what_did_it(store: Store, count: Path) -> None:
+    step = Words("step", count)
+    Engine(store, 1).run([step])
+    done = store.get(step)
+    assert (done.output / "threads").read_text() == "11"
+    assert re.fullmatch(r"\w+, \w+, \d+ cores, \S.*", done.machine)
+    assert re.fullmatch(r"([0-9a-f]{7,}\+?)?", done.commit)
 
 
 ENGINE = """
@@ -211,6 +237,76 @@ def test_what_is_edited_while_the_engine_runs_is_not_taken_for_what_it_was(store
     assert not count.exists(), "nothing was begun"
     Engine(Store(store.folder), 2).run([top])
     assert sum(begun(count).values()) == 4
+
+
+def test_what_is_edited_while_a_step_is_done_spoils_its_result(store: Store, count: Path) -> None:
+    step = Words("step", count, pause=3.0)
+
+    def edit() -> None:
+        until = time.monotonic() + 60
+        while not begun(count) and time.monotonic() < until:
+            time.sleep(0.02)
+        count.with_name("edited").write_text("second edition")
+
+    editing = threading.Thread(target=edit)
+    editing.start()
+    with pytest.raises(UserError, match=r"edition changed while the benchmark ran: start it again"):
+        Engine(store, 1).run([step])
+    editing.join()
+    assert begun(count) == {"step": 1}
+    assert store.find(step) is None
+
+
+def performers() -> list[psutil.Process]:
+    found = []
+    for process in psutil.Process().children(recursive=True):
+        with suppress(psutil.NoSuchProcess, psutil.AccessDenied):
+            if "hdril.benchmark.perform" in process.cmdline():
+                found.append(process)
+    return found
+
+
+def test_a_command_that_outlived_its_process_is_waited_for(store: Store, count: Path) -> None:
+    """Killed alone, as by the kernel for want of memory: a second command would write into the same folder."""
+    step = Words("step", count, pause=4.0, resumes=True)
+
+    def kill() -> None:
+        until = time.monotonic() + 60
+        while not begun(count) and time.monotonic() < until:
+            time.sleep(0.02)
+        for process in performers():
+            process.kill()
+
+    killing = threading.Thread(target=kill)
+    killing.start()
+    with pytest.raises(UserError, match=r"a step failed: step"):
+        Engine(store, 1).run([step])
+    killing.join()
+    assert len(alive(store.folder)) == 1
+    Engine(Store(store.folder), 1).run([step])
+    assert begun(count) == {"step": 1}
+    assert text_of(Store(store.folder), step) == "(step)"
+
+
+def test_time_that_was_spent_before_a_kill_counts_where_a_step_goes_on(store: Store, count: Path) -> None:
+    process = start(store, count, 600.0)
+    until = time.monotonic() + 60
+    spent: list[float] = []
+    while not any(value > 1.0 for value in spent) and time.monotonic() < until:
+        time.sleep(0.05)
+        spent = [float(file.read_text()) for file in store.folder.rglob("spent.txt")]
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert [float(file.read_text()) > 1.0 for file in store.folder.rglob("spent.txt")] == [True]
+    for resumes in (True, False):
+        step = Words(f"resumes {resumes}", count, resumes=resumes)
+        place = store.place(step)
+        assert place is not None
+        place.mkdir(parents=True)
+        (place / "spent.txt").write_text("100.0")
+        Engine(store, 1).run([step])
+        assert (store.get(step).seconds > 100.0) == resumes, "a training begins anew"
+        assert not (place / "spent.txt").exists()
 
 
 def test_two_engines_share_the_work(store: Store, count: Path) -> None:

@@ -11,6 +11,8 @@ import pytest
 from hdril.evaluation.statistics import (
     PairedCounts,
     TrainingSpread,
+    bootstrap_difference,
+    difference_over_trainings,
     holm,
     mcnemar_exact,
     paired_counts,
@@ -161,3 +163,33 @@ def test_one_training_has_no_spread() -> None:
 def test_impossible_trainings_are_refused(successes: tuple[int, ...], trials: int) -> None:
     with pytest.raises(ValueError, match=f"from 0 to {trials} successes"):
         TrainingSpread(successes, trials)
+
+
+def test_the_same_trainings_are_drawn_for_both_at_once() -> None:
+    """Three trainings that succeed on 95, 75 and 55 % lose 3 points each: the difference is as certain as seeds make it."""
+    rng = np.random.default_rng(5)
+    first = rng.random((3, 400)) < np.array([[0.95], [0.75], [0.55]])
+    second = first & (rng.random((3, 400)) > 0.04)
+    apart, together = (difference_over_trainings(second, first, same_trainings=same) for same in (False, True))
+    assert apart[1] - apart[0] > 0.3
+    assert together[1] - together[0] < 0.12
+    assert together[0] <= second.mean() - first.mean() <= together[1]
+    assert bootstrap_difference(second, first, same_trainings=True)[1] < 0.0, "no training gains"
+    with pytest.raises(ValueError, match=r"the same trainings must be as many, got 3 and 2"):
+        bootstrap_difference(second, first[:2], same_trainings=True)
+
+
+def test_several_trainings_are_no_surer_than_their_seeds() -> None:
+    never = np.ones((3, 200), np.bool_)
+    assert bootstrap_difference(never, never) == (0.0, 0.0)
+    alone = paired_difference_interval(PairedCounts(200, 0, 0, 0))
+    assert difference_over_trainings(never, never) == pytest.approx(alone)
+    assert difference_over_trainings(never[:1], never[:1]) == pytest.approx(alone)
+
+
+def test_both_policies_trainings_make_an_interval_wider() -> None:
+    spread = np.array([[True] * 200, [i % 2 == 0 for i in range(200)]])
+    steady = np.tile(np.arange(200) % 4 > 0, (2, 1))
+    for first, second in ((spread, steady), (steady, spread)):
+        low, high = bootstrap_difference(first, second)
+        assert high - low > 0.3
