@@ -204,8 +204,9 @@ def _falls(matrix: Matrix, table: TableSpec, found: Sequence[Mapping[str, Any]])
         if not (control := matrix.evaluations[name].control):
             continue
         first, second = (_outcomes(row["cells"][key], matrix.evaluations[key]) for key in (name, control))
-        fall = _named(row) | {"evaluation": name, "control": control} | _compare(first, second, same_trainings=True)
-        falls.append(fall | _within(fall["pc_difference_ci95"], table.margin))
+        compared = _compare(first, second, same_trainings=True)
+        within = _within(compared["pc_difference_ci95"], table.margin)
+        falls.append(_named(row) | {"evaluation": name, "control": control} | compared | within)
     return _adjusted(falls)
 
 
