@@ -203,6 +203,10 @@ def _check_table(matrix: Matrix, table: TableSpec) -> None:
     for name in table.evaluations:
         if (control := matrix.evaluations[name].control) and control not in table.evaluations:
             raise ValueError(f"table {table.title!r}: {name} needs its control {control} among the evaluations")
+    if not 0.0 <= table.margin <= 100.0:
+        raise ValueError(f"table {table.title!r}: margin must be from 0 to 100 points, got {table.margin:g}")
+    if table.margin and not any(matrix.evaluations[name].control for name in table.evaluations):
+        raise ValueError(f"table {table.title!r}: a margin is for evaluations that have a control, and there are none")
     for name in table.evaluations if table.episode >= 0 else []:
         if table.episode not in (seeds := _seeds(matrix.evaluations[name])):
             raise ValueError(
@@ -267,13 +271,22 @@ def _used_before(path: Path | None) -> list[tuple[str, str, range]]:
     """
     if path is None:
         return []
-    entries: Any = yaml.safe_load(path.read_text())
     try:
-        return [
-            (f"{path} ({entry['why']})", entry["task"], range(entry["first"], entry["last"] + 1)) for entry in entries
-        ]
-    except (KeyError, TypeError):
+        entries: Any = yaml.safe_load(path.read_text())
+        found = [(f"{path} ({entry['why']})", str(entry["task"]), (entry["first"], entry["last"])) for entry in entries]
+    except (KeyError, TypeError, yaml.YAMLError):
         raise ValueError(f"{path} must be a list of entries with task, first, last and why") from None
+    for _, task, (first, last) in found:
+        if task != _ANY_TASK:
+            get_task(task)
+        if not (isinstance(first, int) and isinstance(last, int) and 0 <= first <= last):
+            raise ValueError(f"{path}: first and last must be seeds in this order, got {first} and {last}")
+    if not found:
+        raise ValueError(f"{path} must name at least one seed")
+    return [
+        (why, task if task == _ANY_TASK else base_name(task), range(first, last + 1))
+        for why, task, (first, last) in found
+    ]
 
 
 def _seeds(spec: DataSpec | EvaluationSpec) -> range:

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
-from hdril.benchmark.perform import BUSY, Assignment, start
+from hdril.benchmark.perform import BUSY, Assignment, is_running, start
 from hdril.benchmark.steps import Step
 from hdril.benchmark.store import LOG, Store
 from hdril.errors import UserError
@@ -138,7 +138,7 @@ class Engine:
             place, made_from = self._store.place(step), self._store.made_from(step)
             if place is None or made_from is None:
                 continue
-            if is_busy(place):  # by another engine
+            if is_busy(place) or is_running(place):  # another engine does it, or a command that outlived its process
                 self._later[step] = now + PATIENCE
                 continue
             assignment = Assignment(step, place, self._store.input_folders(step), made_from)

@@ -23,7 +23,7 @@ from threading import Event, Thread
 from typing import Any
 
 from hdril.benchmark.steps import Folders, Step
-from hdril.benchmark.store import DONE, LOG, RESULT, is_done, mark_done
+from hdril.benchmark.store import DONE, LOG, RESULT, checkout_commit, is_done, mark_done
 from hdril.digest import digest_json
 from hdril.files import BusyError, exclusively, write_atomically
 
@@ -69,9 +69,11 @@ def perform(assignment: Assignment) -> int:
     with exclusively(place, f"doing {step.title}"), _alone(place / RUNNING) as running:
         if is_done(place):
             return 0
-        (place / DONE).unlink(missing_ok=True)  # somebody deleted the result
+        if (place / DONE).exists():  # somebody deleted the result
+            (place / SPENT).unlink(missing_ok=True)
+            (place / DONE).unlink()
         _check_unchanged(assignment)
-        output = place / RESULT
+        output, commit = place / RESULT, checkout_commit()
         if not step.resumes:
             shutil.rmtree(output, ignore_errors=True)
         command = step.command(output, assignment.inputs)
@@ -79,10 +81,25 @@ def perform(assignment: Assignment) -> int:
         with _stopwatch(place / SPENT, goes_on=step.resumes) as spent:
             code = 0 if step.resumes and output.exists() else _run(command, place / LOG, running)
         if code == 0:
-            _check_unchanged(assignment)
-            mark_done(place, step, assignment.made_from, shlex.join(command), spent())
-            (place / SPENT).unlink()
+            try:
+                _check_unchanged(assignment)
+                mark_done(place, step, assignment.made_from, shlex.join(command), spent(), commit)
+            except ValueError:
+                shutil.rmtree(output, ignore_errors=True)  # or it would be taken for a whole one the next time
+                raise
+            (place / SPENT).unlink(missing_ok=True)
         return code if code != BUSY else 1
+
+
+def is_running(place: Path) -> bool:
+    """Whether the command of a step runs, maybe without the process that started it."""
+    try:
+        with _alone(place / RUNNING):
+            return False
+    except FileNotFoundError:  # nobody was there
+        return False
+    except BusyError:
+        return True
 
 
 @contextmanager
@@ -95,7 +112,7 @@ def _alone(path: Path) -> Iterator[int]:
     with path.open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             raise BusyError(f"a command in {path.parent} outlived the process that started it; wait for it") from None
         yield file.fileno()
 
@@ -104,7 +121,7 @@ def _alone(path: Path) -> Iterator[int]:
 def _stopwatch(file: Path, goes_on: bool) -> Iterator[Callable[[], float]]:
     """Seconds spent, with those of former attempts if the command goes on where it was. They are on disk at most
     :data:`TICK` seconds late, because a process that is killed cannot write them."""
-    before = float(file.read_text()) if goes_on and file.exists() else 0.0
+    before = float(file.read_text() or 0.0) if goes_on and file.exists() else 0.0
     begun, over = time.monotonic(), Event()
 
     def spent() -> float:

@@ -13,7 +13,8 @@ from hdril.benchmark.steps import Record
 from hdril.evaluation.statistics import TrainingSpread
 from hdril.markdown import table as markdown_table
 
-_HELD_OUT = "No seed of an evaluation was trained or tuned on."
+_HELD_OUT = "No seed of an evaluation was trained on."
+_UNUSED = "None is in `{}`, the list of seeds by which choices were made."
 _TUNING = (
     "**This is for tuning.** No seed of an evaluation was trained on, but choices are made by these numbers: the best of them "
     "are better here than they will be on other seeds."
@@ -27,7 +28,7 @@ def markdown(results: Mapping[str, Any], pictures: Sequence[Sequence[str]] = ())
         "Made by `hdril-benchmark`, one thread a step; the loader of a training may be a second process. Success is in percent, "
         "with the 95 % interval (Wilson) over the seeds for one trained policy. Several trainings are written as trainings × "
         "seeds: the mean, then the range and the standard deviation over trainings. "
-        f"{_TUNING if results['tuning'] else _HELD_OUT} In the commands, `STORE` is the folder of all results, "
+        f"{' '.join(_about_seeds(results))} In the commands, `STORE` is the folder of all results, "
         "`outputs/benchmark/store` unless `--store` names another.",
     ]
     shown = pictures or [()] * len(results["tables"])
@@ -45,9 +46,16 @@ def markdown(results: Mapping[str, Any], pictures: Sequence[Sequence[str]] = ())
     return "\n\n".join(blocks) + "\n"
 
 
+def _about_seeds(results: Mapping[str, Any]) -> list[str]:
+    if results["tuning"]:
+        return [_TUNING]
+    return [_HELD_OUT, *([_UNUSED.format(results["used_seeds"])] if results["used_seeds"] else [])]
+
+
 def _data(table: Mapping[str, Any]) -> str:
+    counts = " and ".join(str(count) for count in sorted({row["demonstrations"] for row in table["rows"]}))
     told = [
-        f"`{name}`: {spec['episodes']} of `{spec['task']}`, seeds from {spec['seed']} on"
+        f"`{name}`: {counts} of `{spec['task']}`, seeds from {spec['seed']} on"
         + "".join(f", `--{noise}={spec[noise]:g}`" for noise in ("perturb", "stray") if spec[noise])
         for name, spec in table["data"].items()
     ]
@@ -127,13 +135,7 @@ def _tests(table: Mapping[str, Any]) -> list[str]:
         for test in table["tests"]
     ]  # fmt: skip
     heads = ["policy", "trained on", "demonstrations", *_both_minutes(table, None), "evaluation", *_DIFFERENCE]
-    caution = (
-        "Few trainings show little of how trainings differ: with two, such an interval covered the truth in 80 % of 300 "
-        "simulations, not in 95."
-        if len(table["training_seeds"]) > 1
-        else "One training of each tells two trained policies apart, not two methods."
-    )
-    told = f"Against `{table['against']}`, seed by seed: {_what_differs(table, table['tests'], 'pair of trainings')} {caution}"
+    told = f"Against `{table['against']}`, seed by seed: {_what_differs(table, table['tests'], 'pair of trainings')}"
     return [told, markdown_table(heads, lines)]
 
 
@@ -154,8 +156,8 @@ def _falls(table: Mapping[str, Any]) -> list[str]:
     if margin:
         heads.append(f"falls by at most {margin:g} points")
         told += (
-            f" That success falls by at most {margin:g} points is shown (yes) where the interval of the difference ends above "
-            f"-{margin:g}, and refuted (no) where it ends below; each row by itself."
+            f" Falls by at most {margin:g} points: yes, the whole interval is at or above -{margin:g}; no, the whole interval is "
+            "below; each row by itself."
         )
     return [told, markdown_table(heads, lines)]
 
@@ -183,15 +185,17 @@ def _what_differs(table: Mapping[str, Any], tests: Sequence[Mapping[str, Any]], 
         else "Newcombe, over seeds"
     )
     count = sum(len(test["p_values"]) for test in tests)
-    return (
+    told = (
         f"the difference in points with its 95 % interval ({interval}), p of McNemar's exact test for each {each}, adjusted by "
         f"Holm's method for these {count} tests, and whether they differ: p is below {SIGNIFICANCE}"
-        + (
-            f" for each {each}, always in the same direction, and the interval is"
-            if several
-            else ", and the interval is"
-        )
-        + " on one side of 0."
+        + (f" for each {each}, always in the same direction," if several else ",")
+        + " and the interval is on one side of 0."
+    )
+    if not several:
+        return f"{told} One training tells about a trained policy, not about a method."
+    return (
+        f"{told} Few trainings show little of how trainings differ: two never show a difference here, and with three the "
+        "interval is still too narrow where trainings differ much."
     )
 
 
@@ -215,7 +219,8 @@ def _commands(table: Mapping[str, Any]) -> str:
         spec = table["data"][row["data"]]
         for command in row["training_commands"]:
             record = Record(spec["task"], row["demonstrations"], spec["seed"], spec["perturb"], spec["stray"])
-            found[shlex.join(record.command(_root(command), {}))] = None
+            # Older reports did not keep this command.
+            found[row.get("record_command") or shlex.join(record.command(_root(command), {}))] = None
             found[command] = None
         found |= dict.fromkeys(run["command"] for runs in row["cells"].values() for run in runs)
     return "<details><summary>Commands of this table</summary>\n\n```\n" + "\n".join(found) + "\n```\n\n</details>"

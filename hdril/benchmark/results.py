@@ -32,9 +32,10 @@ _KEPT = ("n_episodes", "n_success", "pc_success", "held_out", "position_error_cm
 
 
 SIGNIFICANCE = 0.05
-"""Family-wise error of a list of tests."""
-_SHAPE = 3
-"""Of a table as data. It counts up when the report needs what older tables do not have: they are not kept then."""
+"""Family-wise error of a list of tests of trained policies."""
+_SHAPE, _PLAIN_SHAPE = 4, 3
+"""Of a table as data. It counts up when the report needs what older tables do not have: they are not kept then. A plain table,
+without tests, falls and choices of demonstrations, is as it was."""
 
 _LATER = {"stray": 0.0, "margin": 0.0}
 """Options that came later than reports which are kept. A definition that does not use them asks for what it asked for before."""
@@ -50,6 +51,7 @@ def collect(matrix: Matrix, store: Store) -> dict[str, Any]:
     return {
         "name": matrix.name,
         "tuning": matrix.tuning,
+        "used_seeds": str(matrix.used_seeds or ""),
         "tables": [_table(matrix, table, store) | {"made": _made(matrix, table, store)} for table in matrix.tables],
     }
 
@@ -88,7 +90,9 @@ def _asked(matrix: Matrix, table: TableSpec) -> str:
         [_without_later(asdict(known[name])) for name in names]
         for names, known in ((table.data, matrix.data), (table.evaluations, matrix.evaluations))
     )
-    return digest_json([_SHAPE, wordless, data, policies, evaluations])[:SHORT]
+    plain = not (table.against or table.demonstrations or any(spec["control"] for spec in evaluations))
+    shape = _PLAIN_SHAPE if plain else _SHAPE
+    return digest_json([shape, wordless, data, policies, evaluations])[:SHORT]
 
 
 def _without_later(definition: Mapping[str, Any]) -> dict[str, Any]:
@@ -147,6 +151,7 @@ def _row(row: Row, store: Store) -> dict[str, Any]:
         "minutes": row.minutes,
         "steps": steps,
         "training_minutes": [round(done.seconds / 60.0, 1) for done in trainings],
+        "record_command": store.relative(store.get(row.trainings[0].data).command),
         "training_commands": [store.relative(done.command) for done in trainings],
         "cells": {name: [_run(step, store) for step in steps] for name, steps in row.evaluations.items()},
     }
@@ -227,6 +232,7 @@ def _adjusted(tests: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The tests, each with its p-values adjusted for all of them, and whether they show a difference.
 
     They do if every pair of trainings differs, all in the same direction, and the interval of the difference is on one side of 0.
+    One training of each tells two trained policies apart; two of each tell nothing of methods, so that they never show one.
     """
     adjusted = iter(holm([p for test in tests for p in test["p_values"]]))
     for test in tests:
@@ -235,7 +241,7 @@ def _adjusted(tests: list[dict[str, Any]]) -> list[dict[str, Any]]:
         one_side = any(
             all(sign * value > 0.0 for value in (*test["pc_differences"], low, high)) for sign in (1.0, -1.0)
         )
-        test["differs"] = one_side and max(test["p_values_holm"]) < SIGNIFICANCE
+        test["differs"] = one_side and max(test["p_values_holm"]) < SIGNIFICANCE and len(test["p_values"]) != 2
     return tests
 
 

@@ -302,7 +302,13 @@ class Evaluate(Step):
                 *self.options, f"--output_dir={output}"]  # fmt: skip
 
     def digest(self, output: Path) -> str:
-        read_json(output / RESULTS)  # it is whole
+        results = read_json(output / RESULTS)
+        if results["held_out"] is not True:
+            raise ValueError(f"its seeds are not known to be held out: {results['held_out_basis'] or 'nobody checked'}")
+        played_by = results["identity"]["trials"]["software"] | results["identity"]["policy"]["software"]
+        asked = self.settings()["software"]
+        if other := [name for name, version in played_by.items() if asked.get(name, version) != version]:
+            raise ValueError(f"{', '.join(other)} changed while it was played: start it again")
         return digest_file(output / RESULTS)
 
 

@@ -106,14 +106,16 @@ def is_done(place: Path) -> bool:
     return (place / DONE).exists() and (place / RESULT).exists()
 
 
-def mark_done(place: Path, step: Step, made_from: Mapping[str, Any], command: str, seconds: float) -> None:
+def mark_done(
+    place: Path, step: Step, made_from: Mapping[str, Any], command: str, seconds: float, commit: str = ""
+) -> None:
     """Say that the result of a step is whole.
 
     Raises:
         OSError, ValueError: it is not.
     """
     told = {"title": step.title, "digest": step.digest(place / RESULT), "seconds": round(seconds, 1),
-            "command": command, "machine": _machine(), "commit": _commit(), "made_from": made_from}  # fmt: skip
+            "command": command, "machine": _machine(), "commit": commit, "made_from": made_from}  # fmt: skip
     write_atomically(place / DONE, lambda file: file.write(json.dumps(told, indent=1).encode()))
 
 
@@ -132,14 +134,18 @@ def _processor() -> str:
     return models[0] if models else platform.processor() or "unknown"
 
 
-def _commit() -> str:
-    """See :attr:`Done.commit`."""
-    git = ["git", "-C", str(Path(hdril.__file__).parent)]
+def checkout_commit() -> str:
+    """See :attr:`Done.commit`. Empty if hdril is not in a checkout of its own repository."""
+    package = Path(hdril.__file__).parent
     try:
-        found = subprocess.run([*git, "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True)
-        edited = subprocess.run(
-            [*git, "diff", "--quiet", "HEAD", "--", ":/"], capture_output=True, check=False
-        ).returncode
+        _git(package, "ls-files", "--error-unmatch", "__init__.py")
+        edited = _git(package, "status", "--porcelain", "--", ":/hdril", ":/policies", ":/configs")
+        return _git(package, "rev-parse", "--short", "HEAD") + ("+" if edited else "")
     except (OSError, subprocess.CalledProcessError):
         return ""
-    return found.stdout.strip() + ("+" if edited else "")
+
+
+def _git(folder: Path, *command: str) -> str:
+    return subprocess.run(
+        ["git", "-C", str(folder), *command], capture_output=True, text=True, check=True
+    ).stdout.strip()

@@ -157,7 +157,11 @@ def bootstrap_difference(
 
 
 def difference_over_trainings(
-    first: NDArray[np.bool_], second: NDArray[np.bool_], confidence: float = 0.95, same_trainings: bool = False
+    first: NDArray[np.bool_],
+    second: NDArray[np.bool_],
+    confidence: float = 0.95,
+    resamples: int = 10_000,
+    same_trainings: bool = False,
 ) -> tuple[float, float]:
     """Interval for the difference of two mean success rates, in [-1, 1], from as many trainings of each policy.
 
@@ -175,7 +179,7 @@ def difference_over_trainings(
     low, high = np.mean([paired_difference_interval(counts, confidence) for counts in pairs], axis=0).tolist()
     if len(pairs) == 1:
         return low, high
-    lower, upper = bootstrap_difference(first, second, confidence, same_trainings=same_trainings)
+    lower, upper = bootstrap_difference(first, second, confidence, resamples, same_trainings)
     return min(low, lower), max(high, upper)
 
 

@@ -193,3 +193,15 @@ def test_both_policies_trainings_make_an_interval_wider() -> None:
     for first, second in ((spread, steady), (steady, spread)):
         low, high = bootstrap_difference(first, second)
         assert high - low > 0.3
+
+
+@pytest.mark.parametrize(("trainings", "low", "high"), [(2, 0.72, 0.90), (3, 0.82, 0.95), (5, 0.88, 0.99)])
+def test_few_trainings_make_an_interval_too_narrow(trainings: int, low: float, high: float) -> None:
+    """Equal methods of 75 %, trainings that differ by 10 points (SD), 200 seeds: why two never show a difference."""
+    rng, covered = np.random.default_rng(trainings), []
+    for _ in range(300):
+        rates = np.clip(rng.normal(0.75, 0.1, (2, trainings, 1)), 0.0, 1.0)
+        first, second = rng.random((2, trainings, 200)) < rates
+        bounds = difference_over_trainings(first, second, resamples=300)
+        covered.append(bounds[0] <= 0.0 <= bounds[1])
+    assert low <= np.mean(covered) <= high
