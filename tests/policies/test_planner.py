@@ -11,6 +11,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.factory import make_policy
 from lerobot_policy_hdril import HDRILConfig, HDRILPolicy
+from lerobot_policy_hdril.demonstrations import LATEST, History
 from lerobot_policy_hdril.planner import Planner, begin_weights
 from lerobot_policy_hdril.presets import PRESETS
 from torch import Tensor
@@ -143,7 +144,7 @@ def test_the_planner_leaves_something_out_of_episodes_and_of_single_frames(metad
 
 
 def test_the_papers_models_and_once_a_primitive_have_the_plain_planner() -> None:
-    options = ("planner_balance", "planner_dropout", "planner_scale", "least_survival")
+    options = ("planner_balance", "planner_dropout", "planner_late", "planner_scale", "least_survival")
     other = {name for name, values in PRESETS.items() if any(values[option] for option in options)}
     assert other == {"hdril_reactive", "network_reactive"}
 
@@ -247,6 +248,9 @@ def test_a_resumed_policy_weighs_beginnings_as_before(mended, tmp_path: Path) ->
         ),
         ({"planner_balance": -0.1}, r"^policy\.planner_balance must be from 0 to 1"),
         ({"planner_balance": 0.5, "termination": "length"}, r"policy\.termination=learned; got 0\.5 and length$"),
+        ({"planner_late": 1.1}, r"^policy\.planner_late must be from 0 to 1, and is for .*; got 1\.1 and learned$"),
+        ({"planner_late": -0.1}, r"^policy\.planner_late must be from 0 to 1"),
+        ({"planner_late": 0.5, "termination": "length"}, r"policy\.termination=learned; got 0\.5 and length$"),
         ({"planner_dropout": 1.0}, r"^policy\.planner_dropout must be from 0 to less than 1, got 1\.0$"),
         ({"planner_dropout": -0.1}, r"^policy\.planner_dropout must be from 0 to less than 1"),
         ({"planner_scale": -0.05}, r"^policy\.planner_scale must be 0 or a length in m"),
@@ -260,6 +264,92 @@ def test_a_resumed_policy_weighs_beginnings_as_before(mended, tmp_path: Path) ->
 def test_options_of_the_planner_that_make_no_sense_are_refused(values: dict[str, Any], told: str) -> None:
     with pytest.raises(ValueError, match=told):
         HDRILConfig(**SMALL | values)
+
+
+def test_only_a_planner_that_ends_primitives_is_told_of_beginnings_late() -> None:
+    assert HDRILConfig(push_to_hub=False, device="cpu").planner_late == 0.5
+    assert HDRILConfig(push_to_hub=False, device="cpu", termination="length").planner_late == 0.0
+
+
+def made_up_history(seed: int) -> History:
+    """Four episodes of up to 60 frames with runs of 1 to 12 frames, padded by what may be anything."""
+    rng = torch.Generator().manual_seed(seed)
+    label, begins = torch.zeros(4, 60, dtype=torch.long), torch.zeros(4, 60, dtype=torch.bool)
+    playing, elapsed = torch.full((4, 60), 5), torch.zeros(4, 60, dtype=torch.long)
+    for row in range(4):
+        frame = 0
+        while frame < 60:
+            end = min(60, frame + int(torch.randint(1, 13, (), generator=rng)))
+            label[row, frame:end] = int(torch.randint(0, 5, (), generator=rng))
+            begins[row, frame] = True
+            playing[row, frame + 1 : end + 1] = label[row, frame]
+            elapsed[row, frame + 1 : end + 1] = torch.arange(1, len(elapsed[row, frame + 1 : end + 1]) + 1)
+            frame = end
+    mask = torch.arange(60) < torch.tensor([60, 41, 30, 1])[:, None]
+    return History(torch.zeros(4, 60, 2), label, begins, playing, elapsed, mask)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_late_player_goes_on_until_it_begins_and_counts_from_there(seed: int) -> None:
+    history = made_up_history(seed)
+    late = history.late(1.0, torch.Generator().manual_seed(seed))
+    assert torch.equal(late.state, history.state)
+    assert torch.equal(late.primitive, history.primitive), "what is right stays"
+    assert not (history.begins & ~late.begins).any()
+    for row in range(4):
+        frames = int(history.mask[row].sum())
+        starts = [t for t in range(frames) if history.begins[row, t]]
+        assert (int(late.playing[row, 0]), int(late.elapsed[row, 0])) == (5, 0)
+        for start, end in zip(starts, [*starts[1:], frames], strict=True):
+            asked = [t for t in range(start, end) if late.begins[row, t]]
+            delay = asked[-1] - start
+            assert asked == list(range(start, start + delay + 1)), "it is asked until it begins"
+            longest = min(LATEST, end - start - 1) if start else 0
+            assert (1 <= delay <= longest) if longest else delay == 0
+            for t in range(start, end):
+                told = int(late.playing[row, t]), int(late.elapsed[row, t])
+                if t <= asked[-1]:
+                    before = int(late.playing[row, start]), int(late.elapsed[row, start]) + t - start
+                    assert told == before, "what played before goes on"
+                else:
+                    assert told == (int(history.primitive[row, start]), t - asked[-1])
+            if end < frames:
+                told = int(late.playing[row, end]), int(late.elapsed[row, end])
+                assert told == (int(history.primitive[row, start]), end - asked[-1])
+
+
+def test_nobody_is_late_unless_asked() -> None:
+    history = made_up_history(0)
+    same = history.late(0.0, torch.Generator())
+    for name in ("playing", "elapsed", "begins"):
+        assert torch.equal(getattr(same, name)[history.mask], getattr(history, name)[history.mask])
+    some = history.late(0.3, torch.Generator().manual_seed(1)).begins.sum() - history.begins.sum()
+    every = history.late(1.0, torch.Generator().manual_seed(1)).begins.sum() - history.begins.sum()
+    assert 0 < some < 0.6 * every
+
+
+def test_the_planner_learns_what_to_answer_when_it_is_late(mended) -> None:
+    policy = build(mended, preset="hdril_reactive", hidden_dim=32, planner_dropout=0.0, planner_late=1.0)
+    data, rows = demonstrations(policy), torch.tensor([2 * FRAMES, 4 * FRAMES])
+    history, window = data.history(rows), data.window(rows, 2, 2)
+    loss, _ = policy.planner_loss(history, window, torch.Generator().manual_seed(3))
+    late = history.late(1.0, torch.Generator().manual_seed(3))
+    assert torch.equal(policy.planner_loss(late, window)[0], loss)
+    assert not torch.equal(policy.planner_loss(history, window)[0], loss)
+
+
+def test_being_late_is_for_training_and_decided_by_the_batch(metadata) -> None:
+    options = {"preset": "hdril_reactive", "hidden_dim": 32, "planner_dropout": 0.0, "hand_noise": 0.0}
+    late, prompt = (build(metadata, planner_late=share, **options) for share in (1.0, 0.0))
+    prompt.load_state_dict(late.state_dict())
+
+    def losses(training: bool) -> list[float]:
+        with torch.no_grad():
+            return [p.train(training).forward({"index": BATCH})[1]["planner_loss"] for p in (late, late, prompt)]
+
+    first, again, without = losses(training=True)
+    assert first == again != without
+    assert len(set(losses(training=False))) == 1
 
 
 def test_other_graphs_have_no_second_scale_unless_it_is_asked_for() -> None:

@@ -28,7 +28,7 @@ CITATION = """@inproceedings{xie2020deep,
 }"""
 _CHOICES = ("preset", "interaction", "skip", "state_skip", "per_primitive", "decoder", "coordinates", "latent", "termination",
             "filter_frames", "long_filter_frames", "robust", "hand_noise", "fourier_features", "split_forms", "planner_balance",
-            "planner_dropout", "planner_scale", "least_survival", "rollout", "replan_every", "plan_overlap",
+            "planner_dropout", "planner_late", "planner_scale", "least_survival", "rollout", "replan_every", "plan_overlap",
             "hidden_dim")  # fmt: skip
 
 

@@ -29,7 +29,7 @@ Termination = Literal["length", "learned"]
 
 _FREE = (
     "hidden_dim", "termination", "filter_frames", "long_filter_frames", "robust", "hand_noise", "split_forms",
-    "planner_balance", "planner_dropout", "planner_scale", "least_survival", "replan_every", "plan_overlap",
+    "planner_balance", "planner_dropout", "planner_late", "planner_scale", "least_survival", "replan_every", "plan_overlap",
 )  # fmt: skip
 """Options that may differ from the preset's value."""
 _FILTERS = ("filter_frames", "long_filter_frames")
@@ -60,9 +60,9 @@ class HDRILConfig(SingleFrameConfig):
     preset: str = ""
     """Name of a model in :data:`~lerobot_policy_hdril.presets.PRESETS`, which then decides the values of this group, and
     ``hidden_dim``. ``hidden_dim``, ``termination``, ``filter_frames``, ``long_filter_frames``, ``robust``, ``hand_noise``,
-    ``split_forms``, ``planner_balance``, ``planner_dropout``, ``planner_scale``, ``least_survival``, ``replan_every`` and
-    ``plan_overlap`` may be given nevertheless, where the model has a use for them. Empty to set them one by one. Once the policy
-    has learned it is a name only."""
+    ``split_forms``, ``planner_balance``, ``planner_dropout``, ``planner_late``, ``planner_scale``, ``least_survival``,
+    ``replan_every`` and ``plan_overlap`` may be given nevertheless, where the model has a use for them. Empty to set them one by
+    one. Once the policy has learned it is a name only."""
     interaction: Interaction = "object"
     """Graph attention: ``none``; ``scalar``, the paper's node per number of the state; ``object``, a node per object."""
     skip: bool = True
@@ -99,6 +99,11 @@ class HDRILConfig(SingleFrameConfig):
     planner_dropout: float = 0.2
     """Share of the planner's embedded states and hidden states that training leaves out, so that few demonstrations teach more
     (:class:`~lerobot_policy_hdril.planner.Planner`)."""
+    planner_late: float = 0.5
+    """Share of the beginnings that the planner is told of too late when it learns, by up to
+    :data:`~lerobot_policy_hdril.demonstrations.LATEST` frames: as if it had missed them, and still had to answer that the
+    primitive begins (:meth:`~lerobot_policy_hdril.demonstrations.History.late`). Demonstrations show the right moment alone; a
+    planner that once misses it would go on for good. For ``termination=learned`` alone; it is 0 with others."""
     planner_scale: float = 0.05
     """The planner sees the position p of each pose as asinh(p / planner_scale), too, m; 0: not. For ``interaction=object`` alone;
     it is 0 with others."""
@@ -229,7 +234,7 @@ class HDRILConfig(SingleFrameConfig):
             if "plan_overlap" not in self._given:
                 self.plan_overlap = 0
         if self.termination != "learned":
-            for name in ("planner_balance", "least_survival"):
+            for name in ("planner_balance", "planner_late", "least_survival"):
                 if name not in self._given:
                     setattr(self, name, 0.0)
         if self.interaction != "object" and "planner_scale" not in self._given:
@@ -297,6 +302,11 @@ class HDRILConfig(SingleFrameConfig):
             raise ValueError(
                 "policy.least_survival must be from 0 to less than 1, and is for policy.termination=learned; "
                 f"got {self.least_survival} and {self.termination}"
+            )
+        if not 0.0 <= self.planner_late <= 1.0 or (self.planner_late and self.termination != "learned"):
+            raise ValueError(
+                "policy.planner_late must be from 0 to 1, and is for policy.termination=learned; "
+                f"got {self.planner_late} and {self.termination}"
             )
         if not 0.0 <= self.planner_dropout < 1.0:
             raise ValueError(f"policy.planner_dropout must be from 0 to less than 1, got {self.planner_dropout}")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,12 +21,16 @@ import pyarrow.parquet as parquet
 import torch
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor
+from torch.nn import functional as F
 
 from lerobot_policy_hdril.forms import assign, find_forms, halves
 from lerobot_policy_hdril.schema import LANGUAGE, LANGUAGE_STYLE, SUBTASK_KEY, SUBTASK_START, SUBTASKS_PATH
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+LATEST = 6
+"""Frames by which a planner is told of a beginning too late, at most."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,30 @@ class History:
     playing: Tensor
     elapsed: Tensor
     mask: Tensor
+
+    def late(self, share: float, generator: torch.Generator) -> History:
+        """The same episodes, told as by a player that is late: at ``share`` of the beginnings it begins the primitive 1 to
+        :data:`LATEST` frames later. Until then the one before plays on, and at each of these frames the primitive ``begins``.
+
+        The first beginning of an episode is never late, because nothing plays before it, and none lasts as long as the primitive.
+        States and what is right to play stay as they are.
+        """
+        batch, time = self.begins.shape
+        frames = torch.arange(time, device=self.begins.device)
+        begun = torch.where(self.begins, frames, 0).cummax(1).values  # where the run of each frame begins
+        coming = torch.where(self.begins, frames, time).flip(1).cummin(1).values.flip(1)
+        end = torch.minimum(F.pad(coming[:, 1:], (0, 1), value=time), self.mask.sum(1, keepdim=True))
+        drawn = torch.rand(batch, time, generator=generator, device=frames.device) < share
+        delay = torch.randint(1, LATEST + 1, (batch, time), generator=generator, device=frames.device)
+        delay = torch.minimum(delay, end - frames - 1).clamp_min(0).where(self.begins & drawn & (frames > 0), 0)
+        mine = delay.gather(1, begun)
+        before = delay.gather(1, begun.gather(1, (frames - 1).clamp_min(0).expand(batch, -1)))
+        since = frames - begun
+        missed = since <= mine
+        elapsed = torch.where(missed, (self.elapsed - before).gather(1, begun) + since, since - mine)
+        playing = torch.where(missed, self.playing.gather(1, begun), self.playing)
+        begins = self.begins | (missed & (mine > 0))
+        return replace(self, playing=playing, elapsed=elapsed, begins=begins)
 
 
 @dataclass(frozen=True)

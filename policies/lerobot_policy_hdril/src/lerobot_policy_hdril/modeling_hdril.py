@@ -278,12 +278,13 @@ class HDRILPolicy(PreTrainedPolicy):
             raise RuntimeError("this policy has learned nothing yet: train it with lerobot-train")
 
     def _generator_of(self, rows: Tensor) -> torch.Generator | None:
-        """What draws the noise of the hands and what the planner leaves out for a batch of these rows (B,); None where nothing
-        is drawn.
+        """What draws the noise of the hands, what the planner leaves out and what it is told late for a batch of these rows (B,);
+        None where nothing is drawn.
 
         Seeded by the batch: a resumed run brings the same batches, but its new loader has drawn from PyTorch's own generator.
         """
-        if not self.training or (self.hand_noise is None and not self.config.planner_dropout):
+        drawn = self.hand_noise is not None or self.config.planner_dropout or self.config.planner_late
+        if not self.training or not drawn:
             return None
         return torch.Generator(rows.device).manual_seed(zlib.crc32(rows.cpu().numpy().tobytes()))
 
@@ -319,7 +320,9 @@ class HDRILPolicy(PreTrainedPolicy):
         """Cross-entropy over all frames of the episodes, in which rare beginnings count more in training (``planner_balance``),
         and the share of frames at which the most probable answer is the right one; plus cross-entropy over the frames at which
         windows start, each seen without what was before it. That is all that :meth:`predict_action_chunk` has where no episode
-        runs. ``generator`` draws what the planner leaves out."""
+        runs. ``generator`` draws what the planner leaves out, and which beginnings it is told late (``planner_late``)."""
+        if generator is not None and self.config.planner_late:
+            history = history.late(self.config.planner_late, generator)
         told = (history.playing, history.elapsed) if self.planner.steps else (None, None)
         nothing = torch.zeros_like(window.primitive)[:, None]
         alone_told = (nothing + len(self.config.forms), nothing) if self.planner.steps else (None, None)

@@ -15,6 +15,7 @@ _TRAINING = {
     "planner_balance",
     "planner_batch_size",
     "planner_dropout",
+    "planner_late",
     "subtask_key",
     "optimizer_lr",
     "optimizer_weight_decay",
