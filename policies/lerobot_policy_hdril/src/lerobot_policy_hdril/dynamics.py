@@ -39,27 +39,16 @@ def solve_ridge(x: Tensor, y: Tensor, penalty: Tensor) -> tuple[Tensor, Tensor]:
     return solution.mT, (y - x @ solution) / (1.0 - leverage)[..., None]
 
 
-def robust_distances(x: Tensor, y: Tensor, penalty: Tensor) -> Tensor:
-    """How far windows (N,) are from a robust fit of x (N, D) to y (N, W): iteratively reweighted least squares."""
+def usual_windows(x: Tensor, y: Tensor, penalty: Tensor) -> Tensor:
+    """Which windows (N,) are at most :data:`FAR` times as far as the median one from a robust fit of x (N, D) to y (N, W), by
+    iteratively reweighted least squares."""
     weights = torch.ones_like(x[:, :1])
     far = torch.zeros_like(weights)
     for _ in range(3):
         solution = torch.linalg.solve(x.T @ (weights * x) + penalty, x.T @ (weights * y))
         far = (y - x @ solution).norm(dim=1, keepdim=True)
         weights = (2.0 * far.median() / far.clamp_min(1e-9)).square().clamp_max(1.0)
-    return far[:, 0]
-
-
-def usual(far: Tensor) -> Tensor:
-    """Which windows (N,) at these distances (N,) are at most :data:`FAR` times as far as the median one."""
-    return far <= FAR * far.median().clamp_min(1e-6)
-
-
-def usual_windows(x: Tensor, y: Tensor, rows: Tensor, penalty: Tensor) -> Tensor:
-    """Which of the windows ``rows`` (N,) are near a robust fit of x (N, D) to y (N, W): a mask (N,)."""
-    near = rows.clone()
-    near[rows] = usual(robust_distances(x[rows], y[rows], penalty))
-    return near
+    return far[:, 0] <= FAR * far.median().clamp_min(1e-6)
 
 
 class StateSkip(nn.Module):
@@ -116,7 +105,9 @@ class StateSkip(nn.Module):
             starts_here = steps[:, 0] == first
             if scale is not None:
                 distance = scale * target[:, 0, : len(scale)].double()
-                starts_here = usual_windows(inputs, distance, starts_here & mask[:, 0], penalty)
+                starts_here = starts_here & mask[:, 0]
+                near = usual_windows(inputs[starts_here], distance[starts_here], penalty)
+                starts_here = starts_here.masked_scatter(starts_here, near)
             counts = (mask & starts_here[:, None]).sum(0).tolist()
             begin = 0
             for count, columns in groupby(counts):  # steps that the same rows have share their normal equations

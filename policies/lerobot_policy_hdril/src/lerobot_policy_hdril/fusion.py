@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lerobot_policy_hdril.coordinates import Origins, apply, positive, product, towards, unit
-from lerobot_policy_hdril.dynamics import FREE, robust_distances, solve_ridge, usual
+from lerobot_policy_hdril.dynamics import FREE, solve_ridge, usual_windows
 from lerobot_policy_hdril.fourier import FourierFeatures
 from lerobot_policy_hdril.graph import node_of, pose_groups
 
@@ -273,7 +273,7 @@ class FusedMaps(nn.Module):
                 steps that are solved together, the first ones count whose mean squared leave-one-out error of the hands'
                 positions, noise included, is at most :data:`CLEARLY` times the least. What is no pose has the world's. The
                 robust fit takes the first. With these penalties, maps bend where :data:`BENDS` lets them.
-            robust: leave out windows that are far off a first fit in every frame.
+            robust: leave out windows whose first action is far off a first fit in the world's frame.
             noise: covariance (W, W) of noise on the features that the maps are to bear; 0 for none. The penalty grows as if every
                 window were seen with such noise, and the covariance of a frame's errors by what the noise adds to them.
             shrinkage: how far correlations of the frames' errors are shrunk towards 0: with 1, frames count as independent.
@@ -299,7 +299,9 @@ class FusedMaps(nn.Module):
             )
             least = F.pad(least, (0, 1), value=FREE)
             if robust:
-                rows = self._usual(inputs, poses[:, :, 0], rest[:, 0], rows, least[0, 0], noise)
+                world = torch.cat([_same_signs(poses[:1, rows, 0])[0].flatten(1), rest[rows, 0]], dim=-1)
+                penalty = least[0, 0, 0].diag() + rows.sum() * noise
+                rows = rows.masked_scatter(rows, usual_windows(inputs[rows], world, penalty))
             counts = (mask & rows[:, None]).sum(0)
             shown, begin = counts[counts >= SUPPORT * counts[0]].tolist(), 0
             for _, steps in groupby(shown):  # steps that the same rows have are solved together
@@ -312,23 +314,6 @@ class FusedMaps(nn.Module):
                 by_start[first, begin:] = by_start[first, begin - 1]
         for by_start in self._by_start():
             by_start[last + 1 :] = by_start[last]
-
-    @staticmethod
-    def _usual(x: Tensor, poses: Tensor, rest: Tensor, rows: Tensor, least: Tensor, noise: Tensor) -> Tensor:
-        """Which of the windows ``rows`` (N,) are not far off robust fits in every frame (N,): of x (N, W + 1) to the first poses
-        (1 + V F, N, G, 7) and the rest of the first action (N, A - 7 G), with penalties (1 + V F, W + 1).
-
-        What is far off in one frame may be as usual in another. To an object that lies askew, a hand goes as it always does
-        in the object's frame, and as it never does in the world's: such windows tell which frame knows. A window counts by the
-        frame in which it is the nearest. Distances are the same in all frames, so that one in which all are far excuses none."""
-        x, poses, rest = x[rows], _same_signs(poses[:, rows]), rest[rows]
-        far = [
-            robust_distances(x, torch.cat([pose.flatten(1), rest], dim=-1), penalty.diag() + len(x) * noise)
-            for pose, penalty in zip(poses, least, strict=True)
-        ]
-        near = rows.clone()
-        near[rows] = usual(torch.stack(far).min(0).values)
-        return near
 
     def _by_start(self) -> list[Tensor]:
         """All buffers, their starts and steps first."""
