@@ -21,7 +21,8 @@ class Explanation:
     probabilities: NDArray[np.float32]
     """(K,), how probable its planner finds each primitive of the task."""
     plan: NDArray[np.float32] | None = None
-    """(M, 16), the actions from here to the end of the primitive; None unless they were planned at this frame."""
+    """(M, 16), the actions that are planned from here on, to the end of the primitive or for fewer frames; None unless they were
+    planned at this frame."""
     attention: dict[str, float] | None = None
     """Share of the model's attention that each hand and object receives; None if it has no attention."""
     events: tuple[str, ...] = ()

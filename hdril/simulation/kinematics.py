@@ -42,12 +42,12 @@ class Chain:
             joint = parents[link]
             link = attribute(joint, "parent", "link")
             if joint.get("type") == "fixed":
-                pending = _origin(joint) @ pending
+                pending = origin_transform(joint) @ pending
                 continue
             axis = joint.find("axis")
             if joint.get("type") != "revolute" or axis is None or axis.get("xyz", "").split() != ["0", "0", "1"]:
                 raise ValueError(f"{urdf.name}: joint {joint.get('name')!r} is not revolute about z")
-            joints.append((joint, _origin(joint), pending))
+            joints.append((joint, origin_transform(joint), pending))
             pending = np.eye(4)
         joints.reverse()
         self.joints: tuple[Joint, ...] = tuple(
@@ -106,8 +106,9 @@ def attribute(element: ElementTree.Element, child: str, name: str) -> str:
     return value
 
 
-def _origin(joint: ElementTree.Element) -> NDArray[np.float64]:
-    transform, origin = np.eye(4), joint.find("origin")
+def origin_transform(element: ElementTree.Element) -> NDArray[np.float64]:
+    """The <origin> of a joint, shape or inertial as a transform (4, 4); the identity if there is none."""
+    transform, origin = np.eye(4), element.find("origin")
     if origin is not None:
         transform[:3, 3] = [float(v) for v in origin.get("xyz", "0 0 0").split()]
         # URDF: fixed-axis roll, pitch, yaw.

@@ -85,7 +85,6 @@ def test_resumes_while_episodes_are_still_joining(
     at: int, metadata, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also where an episode has joined and is not fitted yet: with these limits, the fit waits after the third batch."""
-    monkeypatch.setattr(fitting, "GROWTH", 1)
     monkeypatch.setattr(fitting, "QUIET", 3)
     episodes = [[0, 3], [3, 0], [1], [1, 0], [0], [0, 1], [5, 4]]
     batches = [torch.tensor([FRAMES * e + 7 * i for e in group for i in range(4)]) for group in episodes]

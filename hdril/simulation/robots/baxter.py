@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Container, Iterable
 from functools import cache
 from importlib.metadata import files
 from itertools import combinations
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
 from hdril.files import cache_folder, write_atomically
 from hdril.geometry import Pose
-from hdril.simulation.kinematics import attribute
+from hdril.simulation.kinematics import attribute, origin_transform
 from hdril.simulation.robots.spec import Actuation, ArmSpec, GripperSpec, RobotSpec
 
 PACKAGE = "example-robot-data"
@@ -96,6 +102,84 @@ def _prepare(link: ElementTree.Element, meshes: bool) -> None:
         ElementTree.SubElement(element, "color", {"rgba": colour})
 
 
+def _put(element: ElementTree.Element, transform: NDArray[np.float64]) -> None:
+    """Give a joint or a shape a new <origin>: the old one may be shared by a shape that is seen and one that collides."""
+    for former in element.findall("origin"):
+        element.remove(former)
+    with warnings.catch_warnings():  # at a pitch of 90 degrees several angles say the same
+        warnings.filterwarnings("ignore", "Gimbal lock detected")
+        turn = Rotation.from_matrix(transform[:3, :3]).as_euler("xyz")
+    ElementTree.SubElement(element, "origin", {"xyz": _text(transform[:3, 3]), "rpy": _text(turn)})
+
+
+def _text(numbers: Iterable[float]) -> str:
+    return " ".join(repr(float(number)) for number in numbers)
+
+
+_INERTIA = (("ixx", 0, 0), ("ixy", 0, 1), ("ixz", 0, 2), ("iyy", 1, 1), ("iyz", 1, 2), ("izz", 2, 2))
+
+
+def _inertial(link: ElementTree.Element) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    """Mass, kg, centre of mass (3,), m, and inertia about the link's origin (3, 3), kg m², all in the link's frame."""
+    inertial = link.find("inertial")
+    if inertial is None:
+        return 0.0, np.zeros(3), np.zeros((3, 3))
+    mass, transform, about_centre = (
+        float(attribute(inertial, "mass", "value")),
+        origin_transform(inertial),
+        np.empty((3, 3)),
+    )
+    for name, row, column in _INERTIA:
+        about_centre[row, column] = about_centre[column, row] = float(attribute(inertial, "inertia", name))
+    turn, centre = transform[:3, :3], transform[:3, 3]
+    return mass, centre, turn @ about_centre @ turn.T + mass * _point_inertia(centre)
+
+
+def _point_inertia(place: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3), m²: inertia of a unit mass at ``place`` about the origin."""
+    return place @ place * np.eye(3) - np.outer(place, place)
+
+
+def _merge(parent: ElementTree.Element, child: ElementTree.Element, transform: NDArray[np.float64]) -> None:
+    """Make ``child``, which stands at ``transform`` (4, 4) in the frame of ``parent``, a part of it."""
+    for shape in [*child.findall("visual"), *child.findall("collision")]:
+        _put(shape, transform @ origin_transform(shape))
+        parent.append(shape)
+    mass, centre, inertia = _inertial(parent)
+    added, place, about_origin = _inertial(child)
+    turn, moved = transform[:3, :3], transform[:3, :3] @ place + transform[:3, 3]
+    total = mass + added
+    middle = (mass * centre + added * moved) / total
+    inertia = inertia + turn @ (about_origin - added * _point_inertia(place)) @ turn.T + added * _point_inertia(moved)
+    inertia = inertia - total * _point_inertia(middle)
+    for former in parent.findall("inertial"):
+        parent.remove(former)
+    inertial = ElementTree.SubElement(parent, "inertial")
+    ElementTree.SubElement(inertial, "origin", {"xyz": _text(middle), "rpy": "0 0 0"})
+    ElementTree.SubElement(inertial, "mass", {"value": repr(total)})
+    ElementTree.SubElement(
+        inertial, "inertia", {name: repr(float(inertia[row, column])) for name, row, column in _INERTIA}
+    )
+
+
+def _merge_fixed(root: ElementTree.Element, kept: Container[str]) -> None:
+    """Make every link that is fixed to another one a part of it, but for those in ``kept``."""
+    links = {link.get("name", ""): link for link in root.findall("link")}
+    for joint in root.findall("joint"):
+        name = attribute(joint, "child", "link")
+        if joint.get("type") != "fixed" or name in kept:
+            continue
+        parent, transform = attribute(joint, "parent", "link"), origin_transform(joint)
+        _merge(links[parent], links[name], transform)
+        for other in root.findall("joint"):
+            if attribute(other, "parent", "link") == name:
+                _put(other, transform @ origin_transform(other))
+                for told in other.findall("parent"):
+                    told.set("link", parent)
+        root.remove(joint)
+        root.remove(links[name])
+
+
 def _write_once(text: str, stem: str) -> Path:
     """A cached file with this content."""
     path = cache_folder() / f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:16]}.urdf"
@@ -108,7 +192,9 @@ def _write_once(text: str, stem: str) -> Path:
 def simulation_urdf(meshes: bool) -> Path:
     """The model that is simulated: the original with its two collision meshes as boxes, less :data:`LEFT_OUT`.
 
-    Kinematics, masses, inertias and limits of what stays are untouched. ``meshes`` keeps the visual meshes (1 s more to load).
+    Links that are fixed to another one are a part of it, but for the tools and the pads: a link takes as long to step whether it
+    can move or not, and the equations of motion are the same. Kinematics, masses, inertias and limits of what stays are
+    untouched. ``meshes`` keeps the visual meshes (1 s more to load).
     """
     tree = ElementTree.parse(source_urdf())
     root = tree.getroot()
@@ -120,6 +206,7 @@ def simulation_urdf(meshes: bool) -> Path:
             root.remove(link)
         else:
             _prepare(link, meshes)
+    _merge_fixed(root, kept={link for arm in BAXTER.arms.values() for link in (arm.tool, *arm.gripper.pads)})
     return _write_once(ElementTree.tostring(root, encoding="unicode"), f"baxter-{'mesh' if meshes else 'simple'}")
 
 
@@ -158,8 +245,8 @@ def _side(link: str) -> str | None:
 
 def _ignored(links: tuple[str, ...]) -> list[tuple[str, str]]:
     """All pairs but: arm against arm, and what is beyond the elbow against torso and pedestal."""
-    shoulder = ("arm_mount", "shoulder", "upper_elbow", "lower_elbow")
-    body = set(COLLISION_BOXES)
+    shoulder = ("shoulder", "upper_elbow")
+    body = {"base"}
 
     def collides(a: str, b: str) -> bool:
         if _side(a) and _side(b):

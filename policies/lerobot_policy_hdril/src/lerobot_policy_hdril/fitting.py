@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 NOISY_COPIES = 4
 """Disturbed copies of each window that tell how much noise of the hands moves what the fused maps see."""
-GROWTH = 4
-"""Fit anew when one new episode has come for every so many of the last fit, ..."""
+GROWTH = 1
+"""Fit anew when so many new episodes have come for each one of the last fit, ..."""
 QUIET = 10
 """... or when so many batches in a row brought none. To fit all episodes anew after each straggler would cost more than
 that gives: of 4,700 shuffled episodes, the last arrives after some 570 batches."""
@@ -79,7 +79,7 @@ class LearnedEpisodes:
         run fits where an uninterrupted one does."""
         if not self._fits or self._count == self._fitted:
             return False
-        return self._quiet >= QUIET or GROWTH * (self._count - self._fitted) >= self._fitted
+        return self._quiet >= QUIET or self._count - self._fitted >= GROWTH * self._fitted
 
     def mark_fitted(self) -> None:
         """The fit is now of all episodes that were seen."""
