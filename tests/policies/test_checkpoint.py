@@ -227,11 +227,12 @@ def test_older_checkpoint_acts_as_it_did_whatever_the_defaults_are_now(metadata,
 
 
 def test_checkpoint_from_before_the_second_scale_acts_without_it(metadata, tmp_path: Path) -> None:
-    saved = build(metadata, preset="hdril_reactive", hidden_dim=32, planner_scale=0.0, planner_dropout=0.0).eval()
+    plain = dict.fromkeys(("planner_scale", "planner_dropout", "planner_late"), 0.0)
+    saved = build(metadata, preset="hdril_reactive", hidden_dim=32, **plain).eval()
     saved.save_pretrained(tmp_path)
-    without(tmp_path, ["planner_scale", "planner_dropout"])
+    without(tmp_path, list(plain))
     older = load(tmp_path)
-    assert older.config.planner_scale == older.config.planner_dropout == 0.0
+    assert older.config.planner_scale == older.config.planner_dropout == older.config.planner_late == 0.0
     first = observation(metadata, [0])
     saved.reset()
     assert torch.equal(older.select_action(first), saved.select_action(first))

@@ -318,6 +318,22 @@ def test_a_late_player_goes_on_until_it_begins_and_counts_from_there(seed: int) 
                 assert told == (int(history.primitive[row, start]), end - asked[-1])
 
 
+def test_delays_are_drawn_for_each_beginning_from_one_to_six_frames() -> None:
+    delays, both = [], []
+    for seed in range(40):
+        history = made_up_history(seed)
+        late = history.late(0.5, torch.Generator().manual_seed(seed))
+        starts = [t for t in range(1, 60) if history.begins[0, t]]
+        found = []
+        for start, end in zip(starts, [*starts[1:], 60], strict=True):
+            if end - start > 7:
+                found.append(int(late.begins[0, start:end].sum()) - 1)
+        delays += found
+        both.append(0 in found and any(found))
+    assert set(delays) == set(range(7))
+    assert sum(both) > 5, "within an episode, too"
+
+
 def test_nobody_is_late_unless_asked() -> None:
     history = made_up_history(0)
     same = history.late(0.0, torch.Generator())

@@ -193,8 +193,8 @@ def simulation_urdf(meshes: bool) -> Path:
     """The model that is simulated: the original with its two collision meshes as boxes, less :data:`LEFT_OUT`.
 
     Links that are fixed to another one are a part of it, but for the tools and the pads: a link takes as long to step whether it
-    can move or not, and the equations of motion are the same. Kinematics, masses, inertias and limits of what stays are
-    untouched. ``meshes`` keeps the visual meshes (1 s more to load).
+    can move or not, and the equations of motion are the same. Kinematics and limits are untouched; masses and inertias are the
+    sums of the parts'. ``meshes`` keeps the visual meshes (1 s more to load).
     """
     tree = ElementTree.parse(source_urdf())
     root = tree.getroot()
@@ -244,7 +244,7 @@ def _side(link: str) -> str | None:
 
 
 def _ignored(links: tuple[str, ...]) -> list[tuple[str, str]]:
-    """All pairs but: arm against arm, and what is beyond the elbow against torso and pedestal."""
+    """All pairs but: arm against arm, and an arm from the elbow on against the base, of which torso and pedestal are parts."""
     shoulder = ("shoulder", "upper_elbow")
     body = {"base"}
 

@@ -100,10 +100,11 @@ class HDRILConfig(SingleFrameConfig):
     """Share of the planner's embedded states and hidden states that training leaves out, so that few demonstrations teach more
     (:class:`~lerobot_policy_hdril.planner.Planner`)."""
     planner_late: float = 0.5
-    """Share of the beginnings that the planner is told of too late when it learns, by up to
+    """Share of the beginnings, but for an episode's first, that the planner is told of too late when it learns, by up to
     :data:`~lerobot_policy_hdril.demonstrations.LATEST` frames: as if it had missed them, and still had to answer that the
-    primitive begins (:meth:`~lerobot_policy_hdril.demonstrations.History.late`). Demonstrations show the right moment alone; a
-    planner that once misses it would go on for good. For ``termination=learned`` alone; it is 0 with others."""
+    primitive begins (:meth:`~lerobot_policy_hdril.demonstrations.History.late`). Each of these frames counts as a beginning does
+    (``planner_balance``). Demonstrations show the right moment alone; a planner that once misses it would go on for good. For
+    ``termination=learned`` alone; it is 0 with others."""
     planner_scale: float = 0.05
     """The planner sees the position p of each pose as asinh(p / planner_scale), too, m; 0: not. For ``interaction=object`` alone;
     it is 0 with others."""

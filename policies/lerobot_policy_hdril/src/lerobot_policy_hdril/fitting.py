@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 NOISY_COPIES = 4
 """Disturbed copies of each window that tell how much noise of the hands moves what the fused maps see."""
 GROWTH = 1
-"""Fit anew when so many new episodes have come for each one of the last fit, ..."""
+"""Fit anew when the episodes that are new are so many times those of the last fit, when all of the data set are there, ..."""
 QUIET = 10
 """... or when so many batches in a row brought none. To fit all episodes anew after each straggler would cost more than
 that gives: of 4,700 shuffled episodes, the last arrives after some 570 batches."""
@@ -79,7 +79,8 @@ class LearnedEpisodes:
         run fits where an uninterrupted one does."""
         if not self._fits or self._count == self._fitted:
             return False
-        return self._quiet >= QUIET or self._count - self._fitted >= GROWTH * self._fitted
+        whole = self._count == len(self.mask)
+        return whole or self._quiet >= QUIET or self._count - self._fitted >= GROWTH * self._fitted
 
     def mark_fitted(self) -> None:
         """The fit is now of all episodes that were seen."""

@@ -320,7 +320,8 @@ class HDRILPolicy(PreTrainedPolicy):
         """Cross-entropy over all frames of the episodes, in which rare beginnings count more in training (``planner_balance``),
         and the share of frames at which the most probable answer is the right one; plus cross-entropy over the frames at which
         windows start, each seen without what was before it. That is all that :meth:`predict_action_chunk` has where no episode
-        runs. ``generator`` draws what the planner leaves out, and which beginnings it is told late (``planner_late``)."""
+        runs. ``generator`` draws what the planner leaves out, and which beginnings it is told late (``planner_late``): in
+        training, the numbers are of these episodes, and a late beginning counts at each of its frames."""
         if generator is not None and self.config.planner_late:
             history = history.late(self.config.planner_late, generator)
         told = (history.playing, history.elapsed) if self.planner.steps else (None, None)
