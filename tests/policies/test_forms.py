@@ -120,9 +120,9 @@ def test_a_checkpoint_keeps_its_forms_whatever_it_learns_from_next(gripping, met
 
 
 def test_a_form_that_few_episodes_show_moves_as_the_primitive_does_in_general(gripping) -> None:
-    policy = build(gripping, learned=False, preset="hdril_reactive", hidden_dim=32)
-    data = demonstrations(policy)
     for episodes, shared in ((range(FEWEST - 1), True), (range(FEWEST), False)):
+        policy = build(gripping, learned=False, preset="hdril_reactive", hidden_dim=32)
+        data = demonstrations(policy)
         policy.forward({"index": torch.tensor([FRAMES * episode for episode in episodes])})
         assert torch.equal(policy.fused[0].weight, policy.fused[1].weight) == shared
     assert data.beginnings(torch.ones(6, dtype=torch.bool)).sum(0).tolist() == [6] * 7
