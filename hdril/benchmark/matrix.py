@@ -95,6 +95,10 @@ class TableSpec:
     beside: list[str] = field(default_factory=list)
     """What is shown beside success: errors against the expert (position_error_cm, angle_error_rad, dtw_cm), how often the policy
     begins with the expert's primitive (pc_expert_choice), and its hands' jerk against the expert's (jerk_to_expert)."""
+    by_primitive: bool = False
+    """Whether the distance from the expert's hands has a table of its own, by the expert's primitives."""
+    published_by_primitive: dict[str, str] = field(default_factory=dict)
+    """Numbers of others in that table, as text, by policy."""
     trajectories: int = 0
     """How many of the demonstrations are drawn, the first ones, with one of them highlighted."""
     episode: int = -1

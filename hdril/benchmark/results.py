@@ -28,7 +28,8 @@ from hdril.evaluation.statistics import (
 from hdril.evaluation.stored import read_evaluation
 
 _KEPT = ("n_episodes", "n_success", "pc_success", "held_out", "position_error_cm", "angle_error_rad", "dtw_cm",
-          "pc_expert_choice", "jerk_to_expert", "n_expert_failures", "stages_reached")  # fmt: skip
+          "position_error_cm_by_primitive", "pc_expert_choice", "jerk_to_expert", "n_expert_failures",
+          "stages_reached")  # fmt: skip
 
 
 SIGNIFICANCE = 0.05
@@ -37,7 +38,7 @@ _SHAPE, _PLAIN_SHAPE = 4, 3
 """Of a table as data. It counts up when the report needs what older tables do not have: they are not kept then. A plain table,
 without tests, falls and choices of demonstrations, is as it was."""
 
-_LATER = {"stray": 0.0, "margin": 0.0}
+_LATER: dict[str, Any] = {"stray": 0.0, "margin": 0.0, "by_primitive": False, "published_by_primitive": {}}
 """Options that came later than reports which are kept. A definition that does not use them asks for what it asked for before."""
 
 
@@ -70,6 +71,7 @@ def keep_tables(matrix: Matrix, results: dict[str, Any], before: Mapping[str, An
                 "note": spec.note,
                 "published": spec.published,
                 "published_by": spec.published_by,
+                "published_by_primitive": spec.published_by_primitive,
                 "data": _data(matrix, spec),
             }
     return results | {"tables": [found[title] for title in specs if title in found]}
@@ -81,7 +83,7 @@ def _data(matrix: Matrix, table: TableSpec) -> dict[str, Any]:
 
 def _asked(matrix: Matrix, table: TableSpec) -> str:
     """Digest of the definition of a table, its texts aside: what it names, and how that is defined."""
-    wordless = _without_later(asdict(replace(table, note="", published={}, published_by="")))
+    wordless = _without_later(asdict(replace(table, note="", published={}, published_by="", published_by_primitive={})))
     policies = [
         asdict(spec) | {"config": digest_file(spec.config)}
         for spec in (matrix.policies[name] for name in table.policies)
@@ -128,6 +130,8 @@ def _table(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
         "beside": table.beside,
         "published": table.published,
         "published_by": table.published_by,
+        "by_primitive": table.by_primitive,
+        "published_by_primitive": table.published_by_primitive,
         "tests": _tests(matrix, table, found),
         "falls": _falls(matrix, table, found),
         "trajectories": {

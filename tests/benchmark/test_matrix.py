@@ -33,6 +33,7 @@ from hdril.demonstrations.read import read_episode
 from hdril.digest import digest_json
 from hdril.evaluation.results import Run, summarise
 from hdril.execution import SlurmConfig
+from hdril.tasks import get_task
 from tests.evaluation.checkpoints import save_hdril
 from tests.evaluation.synthetic import outcome
 from tests.fake_slurm import FakeSlurm
@@ -880,6 +881,42 @@ def test_other_numbers_stand_beside_success(tmp_path: Path) -> None:
         ["0.2 (0.2 to 0.2)", "100 (100 to 100)", "1.25 (1.25 to 1.25)", ""],
         ["0.2 (0.2 to 0.2)", "100 (100 to 100)", "1.25 (1.25 to 1.25)", ""],
     ]
+
+
+def test_errors_by_primitive_have_a_table_of_their_own(tmp_path: Path) -> None:
+    """A primitive that a training never reached does not count in its mean; others' numbers stand beside."""
+
+    def more(values: dict[str, Any]) -> None:
+        one_row(values)
+        values["tables"][0].update(by_primitive=True, published_by_primitive={"linear": "grasp 7, move 9"})
+
+    matrix, store = changed(more), Store(tmp_path / "store")
+    pretend(store, matrix, fails)
+    results = collect(matrix, store)
+    runs = results["tables"][0]["rows"][0]["cells"]["varied"]
+    runs[0]["position_error_cm_by_primitive"] = {"grasp": {"mean": 0.5, "std": 0.1}, "move": {"mean": 2.0, "std": 0.1}}
+    runs[1]["position_error_cm_by_primitive"] = {"grasp": {"mean": 1.5, "std": 0.1}}
+    (told,) = (part for part in markdown(results).split("\n\n") if part.startswith("| ") and "| published" in part)
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in told.splitlines()]
+    primitives = list(get_task("table_lift").labels)
+    assert cells[0] == ["policy", "trained on", "demonstrations", "evaluation", *primitives, "published, cm"]
+    assert cells[2] == [
+        "`linear`",
+        "varied",
+        cells[2][2],
+        "varied",
+        "1 (0.5 to 1.5)",
+        "2",
+        "",
+        "",
+        "",
+        "",
+        "grasp 7, move 9",
+    ]
+    assert cells[3][4:] == [*["0.2 (0.2 to 0.2)"] * 6, ""]
+    assert "by the expert's primitive" not in markdown(collect(changed(one_row), store)), (
+        "who did not ask has no such table"
+    )
 
 
 def by_minutes(values: dict[str, Any]) -> None:
