@@ -204,7 +204,8 @@ def _what_differs(table: Mapping[str, Any], tests: Sequence[Mapping[str, Any]], 
     """What :func:`_difference` tells, in words."""
     several = len(table["training_seeds"]) > 1
     interval = (
-        "two-level bootstrap over trainings and seeds, at least as wide as Newcombe's for one pair of trainings in the mean"
+        "the least that holds the two-level bootstrap's over trainings and seeds, Student's over trainings, and Newcombe's for one "
+        "pair of trainings in the mean"
         if several
         else "Newcombe, over seeds"
     )
@@ -217,10 +218,7 @@ def _what_differs(table: Mapping[str, Any], tests: Sequence[Mapping[str, Any]], 
     )
     if not several:
         return f"{told} One training tells about a trained policy, not about a method."
-    return (
-        f"{told} Few trainings show little of how trainings differ: two never show a difference here, and with three the "
-        "interval is still too narrow where trainings differ much."
-    )
+    return f"{told} Few trainings show little of how trainings differ, so that their interval is wide."
 
 
 def _budget(table: Mapping[str, Any], row: Mapping[str, Any] | None) -> list[str]:
