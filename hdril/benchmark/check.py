@@ -190,12 +190,14 @@ def _check_table(matrix: Matrix, table: TableSpec) -> None:
         ("against", [table.against] if table.against else [], table.policies),
         ("beside", table.beside, BESIDE),
         ("published", list(table.published), table.policies),
+        ("published_by_primitive", list(table.published_by_primitive), table.policies),
     ):
         if missing := [name for name in names if name not in known]:
             raise ValueError(f"table {table.title!r}: {kind} has no {missing[0]!r}; choose from: {', '.join(known)}")
-        if not names and kind not in ("against", "beside", "published"):
+        if not names and kind in ("data", "policies", "evaluations"):
             raise ValueError(f"table {table.title!r} names no {kind}; choose from: {', '.join(known)}")
         _check_once(table, kind, names)
+    _check_by_primitive(matrix, table)
     _check_once(table, "training_seeds", table.training_seeds)
     _check_once(table, "demonstrations", table.demonstrations)
     if not table.training_seeds:
@@ -222,6 +224,24 @@ def _check_table(matrix: Matrix, table: TableSpec) -> None:
         task = base_name(matrix.data[name].task)
         if other := [key for key in table.evaluations if base_name(matrix.evaluations[key].task) != task]:
             raise ValueError(f"table {table.title!r}: evaluation {other[0]} is not of {task}, the task of data {name}")
+
+
+def _check_by_primitive(matrix: Matrix, table: TableSpec) -> None:
+    """The table of errors by primitive; numbers of others must be in one of its columns."""
+    if (table.phases or table.published_by_primitive) and not table.by_primitive:
+        raise ValueError(f"table {table.title!r}: phases and published_by_primitive need by_primitive=true")
+    labels = get_task(matrix.data[table.data[0]].task).labels
+    for phase, primitives in table.phases.items():
+        if unknown := [name for name in primitives if name not in labels]:
+            raise ValueError(f"table {table.title!r}: {phase} has no {unknown[0]!r}; choose from: {', '.join(labels)}")
+        if not primitives:
+            raise ValueError(f"table {table.title!r}: {phase} names no primitive; choose from: {', '.join(labels)}")
+    columns = table.phases or labels
+    for policy, told in table.published_by_primitive.items():
+        if unknown := [name for name in told if name not in columns]:
+            raise ValueError(
+                f"table {table.title!r}: published_by_primitive of {policy} has {unknown[0]!r}; choose from: {', '.join(columns)}"
+            )
 
 
 def _check_once(table: TableSpec, kind: str, values: Sequence[object]) -> None:

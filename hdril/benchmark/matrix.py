@@ -96,9 +96,12 @@ class TableSpec:
     """What is shown beside success: errors against the expert (position_error_cm, angle_error_rad, dtw_cm), how often the policy
     begins with the expert's primitive (pc_expert_choice), and its hands' jerk against the expert's (jerk_to_expert)."""
     by_primitive: bool = False
-    """Whether the distance from the expert's hands has a table of its own, by the expert's primitives."""
-    published_by_primitive: dict[str, str] = field(default_factory=dict)
-    """Numbers of others in that table, as text, by policy."""
+    """Whether the mean distance of the hands from the noise-free expert's has a table of its own, by the expert's primitive."""
+    phases: dict[str, list[str]] = field(default_factory=dict)
+    """Primitives that are told together in that table, by the name of the phase: each of them counts alike. Unless given, each
+    primitive is told by itself."""
+    published_by_primitive: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Numbers of others in that table, cm, by policy and primitive (or phase)."""
     trajectories: int = 0
     """How many of the demonstrations are drawn, the first ones, with one of them highlighted."""
     episode: int = -1

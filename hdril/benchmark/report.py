@@ -13,7 +13,6 @@ from hdril.benchmark.steps import Record
 from hdril.evaluation.statistics import TrainingSpread
 from hdril.markdown import table as markdown_table
 
-_ERRORS = "position_error_cm_by_primitive"
 _HELD_OUT = "No seed of an evaluation was trained on."
 _UNUSED = "None is in `{}`, the list of seeds by which choices were made."
 _TUNING = (
@@ -129,25 +128,36 @@ def _mean(runs: Sequence[Mapping[str, Any]], name: str) -> str:
 
 def _by_primitive(table: Mapping[str, Any]) -> list[str]:
     """How far the hands are from the expert's, by the expert's primitive; nothing unless the table asks for it."""
-    if not table.get("by_primitive"):
+    if not (phases := table.get("by_primitive")):
         return []
-    found = [(row, name, row["cells"][name]) for row in table["rows"] for name in table["evaluations"]]
-    errors = [run[_ERRORS] for _, _, runs in found for run in runs]
-    primitives = list(dict.fromkeys(primitive for error in errors for primitive in error))
-    published = table["published_by_primitive"]
     lines = [
         [f"`{row['policy']}`", row["data"], row["demonstrations"], *_budget(table, row), name,
-         *(_mean([{primitive: run[_ERRORS].get(primitive)} for run in runs], primitive) for primitive in primitives),
-         *([published.get(row["policy"], "")] if published else [])]
-        for row, name, runs in found
+         *(_error(row["cells"][name], primitives) for primitives in phases.values())]
+        for row in table["rows"] for name in table["evaluations"]
     ]  # fmt: skip
-    heads = ["policy", "trained on", "demonstrations", *_budget(table, None), "evaluation", *primitives]
-    heads += ["published, cm"] if published else []
+    lines += [
+        [f"`{policy}`", "", "", *([""] if _budget(table, None) else []), "published",
+         *(f"{told[phase]:g}" if phase in told else "" for phase in phases)]
+        for policy, told in table["published_by_primitive"].items()
+    ]  # fmt: skip
+    heads = ["policy", "trained on", "demonstrations", *_budget(table, None), "evaluation", *phases]
+    together = any(primitives != [phase] for phase, primitives in phases.items())
+    listed = "; ".join(f"{phase}: {', '.join(primitives)}" for phase, primitives in phases.items())
     told = (
-        "How far the hands are from the noise-free expert's, by the expert's primitive: the mean over frames, hands and seeds "
-        "that the expert solves, cm."
+        "How far the hands are from the noise-free expert's, by the expert's primitive, cm: the mean over the seeds that the "
+        "expert solves, without those whose episode ended before. Several trainings: their mean and, in brackets, range."
+        + (f" Primitives of a phase count alike: {listed}." if together else "")
     )
     return [told, markdown_table(heads, lines)]
+
+
+def _error(runs: Sequence[Mapping[str, Any]], primitives: Sequence[str]) -> str:
+    """The mean over ``primitives`` in each training that reached all of them; it is told if others did not."""
+    errors = [run["position_error_cm_by_primitive"] for run in runs]
+    reached = [error for error in errors if all(name in error for name in primitives)]
+    means = [sum(error[name]["mean"] for name in primitives) / len(primitives) for error in reached]
+    few = "" if len(reached) in (0, len(runs)) else f", {len(reached)} of {len(runs)} trainings"
+    return _mean([{"error": mean} for mean in means], "error") + few
 
 
 def _tests(table: Mapping[str, Any]) -> list[str]:
@@ -204,8 +214,8 @@ def _what_differs(table: Mapping[str, Any], tests: Sequence[Mapping[str, Any]], 
     """What :func:`_difference` tells, in words."""
     several = len(table["training_seeds"]) > 1
     interval = (
-        "the least that holds the two-level bootstrap's over trainings and seeds, Student's over trainings, and Newcombe's for one "
-        "pair of trainings in the mean"
+        "the least that holds the two-level bootstrap's over trainings and seeds, Student's over trainings, and Newcombe's for "
+        "one pair of trainings in the mean"
         if several
         else "Newcombe, over seeds"
     )

@@ -26,6 +26,7 @@ from hdril.evaluation.statistics import (
     wilson_interval,
 )
 from hdril.evaluation.stored import read_evaluation
+from hdril.tasks import get_task
 
 _KEPT = ("n_episodes", "n_success", "pc_success", "held_out", "position_error_cm", "angle_error_rad", "dtw_cm",
           "position_error_cm_by_primitive", "pc_expert_choice", "jerk_to_expert", "n_expert_failures",
@@ -38,7 +39,9 @@ _SHAPE, _PLAIN_SHAPE = 5, 3
 """Of a table as data. It counts up when the report needs what older tables do not have: they are not kept then. A plain table,
 without tests, falls and choices of demonstrations, is as it was."""
 
-_LATER: dict[str, Any] = {"stray": 0.0, "margin": 0.0, "by_primitive": False, "published_by_primitive": {}}
+_LATER: dict[str, Any] = {
+    "stray": 0.0, "margin": 0.0, "by_primitive": False, "phases": {}, "published_by_primitive": {},
+}  # fmt: skip
 """Options that came later than reports which are kept. A definition that does not use them asks for what it asked for before."""
 
 
@@ -130,7 +133,7 @@ def _table(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
         "beside": table.beside,
         "published": table.published,
         "published_by": table.published_by,
-        "by_primitive": table.by_primitive,
+        "by_primitive": _phases(matrix, table) if table.by_primitive else {},
         "published_by_primitive": table.published_by_primitive,
         "tests": _tests(matrix, table, found),
         "falls": _falls(matrix, table, found),
@@ -143,6 +146,11 @@ def _table(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
             for name, step in drawn(matrix, table).items()
         },
     }
+
+
+def _phases(matrix: Matrix, table: TableSpec) -> dict[str, list[str]]:
+    """Primitives by what tells of them: their phase, or else each by itself, in the order of the task."""
+    return table.phases or {name: [name] for name in get_task(matrix.data[table.data[0]].task).labels}
 
 
 def _row(row: Row, store: Store) -> dict[str, Any]:

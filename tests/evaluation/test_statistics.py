@@ -212,7 +212,9 @@ def test_a_bootstrap_over_few_trainings_is_too_narrow_and_ours_is_not(trainings:
 
 def test_student_takes_trainings_for_what_differs() -> None:
     """Rates of 40, 60 and 80 % against 70, 80 and 90 %: pooled variance (0.04 + 0.01) / 2, four degrees of freedom."""
-    first, second = (np.arange(100) < np.array([[share] for share in shares]) for shares in ((40, 60, 80), (70, 80, 90)))
+    first, second = (
+        np.arange(100) < np.array([[share] for share in shares]) for shares in ((40, 60, 80), (70, 80, 90))
+    )
     half = 2.776445105 * sqrt(0.025 * 2 / 3)
     assert student_difference(first, second) == pytest.approx((-0.2 - half, -0.2 + half))
     paired = 4.302652730 * sqrt(0.01 / 3)
