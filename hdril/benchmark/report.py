@@ -42,7 +42,7 @@ def markdown(results: Mapping[str, Any], pictures: Sequence[Sequence[str]] = ())
             _rows(table),
         ]
         blocks += [f"![{table['title']}]({name})" for name in names]
-        blocks += [*_by_primitive(table), *_tests(table), *_falls(table), _commands(table)]
+        blocks += [*_by_primitive(table), *_tests(table), *_falls(table), _commands(table), *_failures(table)]
     return "\n\n".join(blocks) + "\n"
 
 
@@ -242,6 +242,34 @@ def _both_minutes(table: Mapping[str, Any], test: Mapping[str, Any] | None) -> l
     """The same for the two policies of a test."""
     budget = _budget(table, test)
     return [*budget, _minutes(test["against_minutes"]) if test else "to the other"] if budget else []
+
+
+LISTED = 5
+"""Failed seeds of an evaluation that are listed."""
+
+
+def _failures(table: Mapping[str, Any]) -> list[str]:
+    """The first failed seeds of each evaluation, folded, and how to see why; nothing if none failed."""
+    lines = []
+    for row in table["rows"]:
+        for name, runs in row["cells"].items():
+            for run in (run for run in runs if run["failed_seeds"]):
+                seeds = run["failed_seeds"]
+                rest = f" and {len(seeds) - LISTED} more" if len(seeds) > LISTED else ""
+                minutes = f", {_minutes(row['minutes'])} minutes" if row["minutes"] else ""
+                lines.append(
+                    f"- `{row['policy']}` ({row['data']}, {row['demonstrations']} demonstrations{minutes}, training seed "
+                    f"{run['training_seed']}) on {name}: {', '.join(map(str, seeds[:LISTED]))}{rest}"
+                )
+    if not lines:
+        return []
+    told = (
+        "A recording for Rerun shows why an episode failed: run the evaluation's command, above, with these options at its end, "
+        "`--seed=SEED --num_episodes=1 --rerun=failures --output_dir=FOLDER`. All failed seeds are in the JSON beside this page."
+    )
+    return [
+        "<details><summary>Failed seeds of this table</summary>\n\n" + "\n".join([told, "", *lines]) + "\n\n</details>"
+    ]
 
 
 def _commands(table: Mapping[str, Any]) -> str:

@@ -561,6 +561,26 @@ def test_policies_are_compared_on_the_same_demonstrations(tmp_path: Path) -> Non
     assert found == {("nominal", 10, 75.0), ("nominal", 50, 50.0), ("varied", 10, 62.5), ("varied", 50, 37.5)}
 
 
+def test_failed_seeds_are_listed_with_a_way_to_see_them(tmp_path: Path) -> None:
+    matrix, store = changed(one_row), Store(tmp_path / "store")
+    pretend(store, matrix, fails)
+    results = collect(matrix, store)
+    text = markdown(results)
+    folded = text[text.index("<details><summary>Failed seeds") :].split("</details>")[0].splitlines()
+    listed = [line for line in folded if line.startswith("- ")]
+    assert len(listed) == sum(
+        bool(run["failed_seeds"]) for row in results["tables"][0]["rows"] for run in row["cells"]["varied"]
+    )
+    first = ", ".join(str(SEED + number) for number in range(5))
+    assert (
+        listed[0] == f"- `linear` (varied, 50 demonstrations, training seed 1) on varied: {first} and {COUNT - 5} more"
+    )
+    assert "`--seed=SEED --num_episodes=1 --rerun=failures --output_dir=FOLDER`" in text
+    store = Store(tmp_path / "another")
+    pretend(store, matrix, lambda step: set())
+    assert "Failed seeds" not in markdown(collect(matrix, store))
+
+
 def test_all_commands_stand_below_their_table(tmp_path: Path) -> None:
     matrix, store = changed(one_row), Store(tmp_path / "store")
     pretend(store, matrix, fails)
