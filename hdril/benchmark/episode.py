@@ -55,8 +55,9 @@ def play(
 
 
 def first_attention(worker: Worker, seed: int) -> dict[str, Any] | None:
-    """What the nodes of a policy's graph attend to at the first frame: ``nodes``, names; ``primitive``, which begins; ``weights``
-    (N, N), of the model of that primitive: row u says how much node u takes from each, and sums to 1.
+    """What the nodes of a policy's graph attend to at the first frame: ``nodes``, names; ``primitive``, which begins; ``of``, the
+    part of the policy, dynamics or planner; ``weights`` (N, N) of the model of that primitive, or of the planner where the
+    dynamics have no graph: row u says how much node u takes from each, and sums to 1.
 
     None for a policy that does not explain itself as :class:`lerobot_policy_hdril.HDRILPolicy` does, and for one whose nodes
     attend to themselves alone.
@@ -68,10 +69,11 @@ def first_attention(worker: Worker, seed: int) -> dict[str, Any] | None:
     actor.reset(seed)
     actor.act(observation)
     told = actor.policy.attention()
-    weights = told.dynamics[0].numpy(force=True).astype(float).round(3)
-    if (weights == np.eye(len(weights))).all():
-        return None
-    return {"nodes": told.nodes, "primitive": told.primitives[0], "weights": weights.tolist()}
+    for part in ("dynamics", "planner"):
+        weights = getattr(told, part)[0].numpy(force=True).astype(float).round(3)
+        if (weights != np.eye(len(weights))).any():
+            return {"nodes": told.nodes, "primitive": told.primitives[0], "of": part, "weights": weights.tolist()}
+    return None
 
 
 def main() -> None:

@@ -35,7 +35,7 @@ def write_report(document: Path, results: Mapping[str, Any]) -> list[Path]:
         return document.with_name(document.name + suffix)
 
     drawn = [figures(table) for table in results["tables"]]
-    files: dict[Path, bytes] = {beside(".json"): json.dumps(results, indent=1).encode()}
+    files: dict[Path, bytes] = {beside(".json"): _one_table_a_line(results).encode()}
     names = []
     for table, found in zip(results["tables"], drawn, strict=True):
         names.append([f"{document.name}_{slug(table['title'])}_{name}" for name in found])
@@ -48,6 +48,12 @@ def write_report(document: Path, results: Mapping[str, Any]) -> list[Path]:
     for path, data in files.items():
         write_atomically(path, lambda file, data=data: file.write(data))
     return list(files)
+
+
+def _one_table_a_line(results: Mapping[str, Any]) -> str:
+    """JSON that is small, and of which a change of one table changes one line."""
+    marked = json.dumps({**results, "tables": []})
+    return marked.replace('"tables": []', '"tables": [\n' + ",\n".join(map(json.dumps, results["tables"])) + "\n]")
 
 
 def slug(title: str) -> str:

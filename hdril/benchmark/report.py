@@ -30,6 +30,7 @@ def markdown(results: Mapping[str, Any], pictures: Sequence[Sequence[str]] = ())
         "seeds: the mean, then the range and the standard deviation over trainings. "
         f"{' '.join(_about_seeds(results))} In the commands, `STORE` is the folder of all results, "
         "`outputs/benchmark/store` unless `--store` names another.",
+        *_losses(results["tables"]),
     ]
     shown = pictures or [()] * len(results["tables"])
     for table, names in zip(results["tables"], shown, strict=True):
@@ -44,6 +45,44 @@ def markdown(results: Mapping[str, Any], pictures: Sequence[Sequence[str]] = ())
         blocks += [f"![{table['title']}]({name})" for name in names]
         blocks += [*_by_primitive(table), *_tests(table), *_falls(table), _commands(table), *_failures(table)]
     return "\n\n".join(blocks) + "\n"
+
+
+def _losses(tables: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Where the policy that a table is about loses, before all else: others that are better, and events that cost too much."""
+    tests = [(table, test) for table in tables for test in table["tests"]]
+    falls = [(table, fall) for table in tables for fall in table["falls"] if fall.get("margin")]
+    if not tests and not falls:
+        return []
+    lines = []
+    for table, test in tests:
+        if test["pc_difference"] > 0.0:
+            shown = "better" if test["differs"] else "ahead, which is not shown to be more than chance"
+            lines.append(
+                f"- {table['title']}: `{test['policy']}` is {shown}, against `{table['against']}` on {test['evaluation']} "
+                f"({_trained_on(table, test)}): {_difference(test)[0]} points."
+            )
+    for table, fall in falls:
+        if fall["within"] != "yes":
+            told = (
+                "success falls by more than"
+                if fall["within"] == "no"
+                else "it is not shown that success falls by at most"
+            )
+            lines.append(
+                f"- {table['title']}: `{fall['policy']}` on {fall['evaluation']} ({_trained_on(table, fall)}): {told} "
+                f"{fall['margin']:g} points: {_difference(fall)[0]}."
+            )
+    order = {"better": 0, "falls by more": 1}
+    lines.sort(key=lambda line: min([rank for words, rank in order.items() if words in line], default=2))
+    return [
+        "## Where it loses",
+        "\n".join(lines) or "No other policy is ahead, and no event costs more than its margin.",
+    ]
+
+
+def _trained_on(table: Mapping[str, Any], test: Mapping[str, Any]) -> str:
+    minutes = f", {_minutes(test['minutes'])} minutes" if test["minutes"] else ""
+    return f"trained on {test['demonstrations']} of {test['data']}{minutes}"
 
 
 def _about_seeds(results: Mapping[str, Any]) -> list[str]:

@@ -42,17 +42,20 @@ def test_a_mishap_is_played(tmp_path: Path) -> None:
     assert len(episode["predicted"]["left"]) == get_task("table_lift:level=hard").budget
 
 
-def test_attention_is_of_the_first_frame(dataset: Path, tmp_path: Path) -> None:
-    policy = save_hdril(tmp_path / "policy", dataset)
+@pytest.mark.parametrize(("preset", "part"), [("hdril", "dynamics"), ("linear", "planner")])
+def test_attention_is_of_the_first_frame(dataset: Path, tmp_path: Path, preset: str, part: str) -> None:
+    """Of the model of the primitive, or of the planner where that has no graph."""
+    policy = save_hdril(tmp_path / "policy", dataset, preset=preset)
     told = play(str(policy), "table_lift", SEED, [], mishap="hands_stay")["attention"]
     assert told["nodes"] == ["left", "right", "table"]
     assert told["primitive"] in get_task("table_lift").labels
+    assert told["of"] == part
     weights = np.array(told["weights"])
     assert weights.shape == (3, 3)
     np.testing.assert_allclose(weights.sum(1), 1.0, atol=2e-3)
     actor, env = LeRobotActor(str(policy), get_task("table_lift")), BimanualEnv("table_lift")
     actor.act(env.reset(seed=SEED)[0])
-    np.testing.assert_allclose(weights, actor.policy.attention().dynamics[0].detach(), atol=6e-4)
+    np.testing.assert_allclose(weights, getattr(actor.policy.attention(), part)[0].detach(), atol=6e-4)
 
 
 def test_a_policy_that_fails_is_drawn_as_long_as_it_lasts(tmp_path: Path) -> None:

@@ -444,7 +444,12 @@ EPISODE = {
     "success": False,
     "predicted": {"left": [[0.1, 0.2, 0.3], [0.2, 0.2, 0.3]], "right": [[0.1, -0.2, 0.3], [0.2, -0.2, 0.3]]},
     "true": {"left": [[0.1, 0.2, 0.4]], "right": [[0.1, -0.2, 0.5]]},
-    "attention": {"nodes": ["left", "right"], "primitive": "grasp", "weights": [[0.25, 0.75], [1.0, 0.0]]},
+    "attention": {
+        "nodes": ["left", "right"],
+        "primitive": "grasp",
+        "of": "planner",
+        "weights": [[0.25, 0.75], [1.0, 0.0]],
+    },
 }
 
 
@@ -559,6 +564,70 @@ def test_policies_are_compared_on_the_same_demonstrations(tmp_path: Path) -> Non
         if test["policy"] == "act"
     }
     assert found == {("nominal", 10, 75.0), ("nominal", 50, 50.0), ("varied", 10, 62.5), ("varied", 50, 37.5)}
+
+
+def test_what_loses_comes_first(tmp_path: Path) -> None:
+    """Before all tables: a policy that is better, one that is ahead by chance, and an event that costs more than its margin."""
+    failing = {"hdril": 30, "linear": 0, "act": 29}
+
+    def more(values: dict[str, Any]) -> None:
+        one_row(values)
+        with_a_control(values)
+        for name in ("varied", "calm", "push"):
+            values["evaluations"][name]["episodes"] = 40
+        first = values["tables"][0] | {"training_seeds": [1]}
+        lift = first | {"evaluations": ["varied"], "against": "hdril"}
+        values["tables"] = [lift, first | {"title": "Events", "margin": 5, "policies": ["act", "hdril"]}]
+
+    def lost(step: Evaluate) -> set[int]:
+        if step.name == "varied":
+            return set(range(SEED, SEED + failing[step.policy.name]))
+        return set(range(SEED, SEED + 20)) if (step.name, step.policy.name) == ("push", "act") else set()
+
+    matrix, store = changed(more), Store(tmp_path / "store")
+    check(matrix)
+    pretend(store, matrix, lost)
+    results = collect(matrix, store)
+    text = markdown(results)
+    section = text[text.index("## Where it loses") : text.index("## Lift")].strip().splitlines()[2:]
+    assert [line.split(": ")[1].split(" (")[0] for line in section] == [
+        "`linear` is better, against `hdril` on varied",
+        "`act` on push",
+        "`act` is ahead, which is not shown to be more than chance, against `hdril` on varied",
+        "`hdril` on push",
+    ]
+    assert "(trained on 50 of varied): +75.0 (" in section[0]
+    assert "success falls by more than 5 points: -50.0 (" in section[1]
+    assert "it is not shown that success falls by at most 5 points: +0.0 (" in section[3]
+    plain = changed(lambda values: (more(values), values["tables"][0].update(against=""), values["tables"].pop()))
+    assert "Where it loses" not in markdown(collect(plain, store)), "nothing is compared"
+    winner = changed(
+        lambda values: (more(values), values["tables"][0].update(against="linear"), values["tables"].pop())
+    )
+    assert "No other policy is ahead" in markdown(collect(winner, store))
+
+
+def test_what_was_noticed_stands_beside_success(tmp_path: Path) -> None:
+    """Two of eight episodes, one of which succeeds; none in another policy, of which nothing is said then."""
+
+    def more(values: dict[str, Any]) -> None:
+        one_row(values)
+        values["tables"][0].update(beside=["pc_noticed", "pc_success_noticed"], training_seeds=[1])
+
+    matrix, store = changed(more), Store(tmp_path / "store")
+    pretend(store, matrix, lambda step: {SEED})
+    (step,) = (step for step in steps(matrix) if step.policy.name == "hdril")
+    path = store.get(step).output / "results.json"
+    told = json.loads(path.read_text())
+    for episode in told["per_episode"][:2]:
+        episode["noticed"] = [[14, "grasp tried again"]]
+    path.write_text(json.dumps(told))
+    cells = cells_of(markdown(collect(matrix, store)), "varied: success where it did, %")
+    assert [(row[0], *row[-2:]) for row in cells[1:]] == [
+        ("`linear`", "0", ""),
+        ("`act`", "0", ""),
+        ("`hdril`", "25", "50"),
+    ]
 
 
 def test_failed_seeds_are_listed_with_a_way_to_see_them(tmp_path: Path) -> None:

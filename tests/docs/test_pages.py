@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -45,6 +46,31 @@ def test_the_readme_has_at_most_500_words_and_the_two_commands() -> None:
     text = (ROOT / "README.md").read_text()
     assert len(text.split()) <= 500
     assert "make demo\nmake test\n" in text
+
+
+HEADLINES = {
+    "Table lift": "table lift",
+    "Handover": "handover",
+    "Peg in hole": "peg-in-hole",
+    "Clear and lift": "clear and lift",
+}
+
+
+def test_headline_numbers_are_those_of_the_benchmark() -> None:
+    """README's and the first ones of the results, by the data of the page that has the commands."""
+    tables = {table["title"]: table for table in json.loads((ROOT / "docs/benchmark/suite.json").read_text())["tables"]}
+    readme, results = ((ROOT / name).read_text() for name in ("README.md", "docs/results.md"))
+    for title, task in HEADLINES.items():
+        (row,) = tables[title]["rows"]
+        for name, runs in row["cells"].items():
+            (run,), level = runs, name.split(", ")[1]
+            low, high = (f"{bound:.3g}" for bound in run["pc_success_ci95"])
+            success = f"{run['n_success']} of {run['n_episodes']} | {low} to {high} %"
+            expert = run["n_episodes"] - run["n_expert_failures"]
+            beside = f"{expert} | {run['pc_expert_choice']:.3g} % | {run['jerk_to_expert']:.2f}"
+            assert f"| {task}, `{level}` | {row['demonstrations']} | {success} | {beside} |" in results
+            if level == "varied":
+                assert f"| {task}, everything varied | {row['demonstrations']} | {success} |" in readme
 
 
 @each_page

@@ -52,11 +52,13 @@ def save_stock(folder: Path, policy: PreTrainedPolicy, metadata: LeRobotDatasetM
     return folder
 
 
-def save_hdril(folder: Path, dataset: Path, episodes: tuple[int, ...] = (0, 1, 2, 3, 4, 5)) -> Path:
+def save_hdril(
+    folder: Path, dataset: Path, episodes: tuple[int, ...] = (0, 1, 2, 3, 4, 5), preset: str = "hdril"
+) -> Path:
     """HDR-IL that saw one frame of each of these episodes: what is solved is solved, and nothing else is trained."""
     metadata = LeRobotDatasetMetadata("hdril/test", root=dataset)
     torch.manual_seed(0)
-    policy = make_policy(HDRILConfig(device="cpu", push_to_hub=False, preset="hdril"), ds_meta=metadata)
+    policy = make_policy(HDRILConfig(device="cpu", push_to_hub=False, preset=preset), ds_meta=metadata)
     starts = metadata.episodes["dataset_from_index"]
     policy.train()
     policy.forward({"index": torch.tensor([starts[episode] for episode in episodes])})
