@@ -234,6 +234,7 @@ def _check_by_primitive(matrix: Matrix, table: TableSpec) -> None:
     for phase, primitives in table.phases.items():
         if unknown := [name for name in primitives if name not in labels]:
             raise ValueError(f"table {table.title!r}: {phase} has no {unknown[0]!r}; choose from: {', '.join(labels)}")
+        _check_once(table, phase, primitives)
         if not primitives:
             raise ValueError(f"table {table.title!r}: {phase} names no primitive; choose from: {', '.join(labels)}")
     columns = table.phases or labels

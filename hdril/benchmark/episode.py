@@ -69,11 +69,11 @@ def first_attention(worker: Worker, seed: int) -> dict[str, Any] | None:
     actor.reset(seed)
     actor.act(observation)
     told = actor.policy.attention()
-    for part in ("dynamics", "planner"):
-        weights = getattr(told, part)[0].numpy(force=True).astype(float).round(3)
-        if (weights != np.eye(len(weights))).any():
-            return {"nodes": told.nodes, "primitive": told.primitives[0], "of": part, "weights": weights.tolist()}
-    return None
+    part = "planner" if actor.policy.config.decoder == "linear" else "dynamics"
+    weights = getattr(told, part)[0].numpy(force=True).astype(float).round(3)
+    if (weights == np.eye(len(weights))).all():
+        return None
+    return {"nodes": told.nodes, "primitive": told.primitives[0], "of": part, "weights": weights.tolist()}
 
 
 def main() -> None:

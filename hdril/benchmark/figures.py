@@ -41,7 +41,7 @@ def _attention(attending: Mapping[str, Mapping[str, Any]]) -> Figure:
 
     nodes = max((told["nodes"] for told in attending.values()), key=len)
     count = len(nodes)
-    panels = [(f"{name}\n{told['of']}, {told['primitive']}", told) for name, told in attending.items()]
+    panels = [(f"{name}\n{told.get('of', 'dynamics')}, {told['primitive']}", told) for name, told in attending.items()]
     panels.append(("uniform attention", {"nodes": nodes, "weights": [[1.0 / count] * count] * count}))
     figure = Figure(figsize=(1.5 + (1.8 + 0.16 * count) * len(panels), 1.9 + 0.16 * count), layout="constrained")
     for axes, (title, told) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):

@@ -48,41 +48,52 @@ def markdown(results: Mapping[str, Any], pictures: Sequence[Sequence[str]] = ())
 
 
 def _losses(tables: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Where the policy that a table is about loses, before all else: others that are better, and events that cost too much."""
+    """Before all else: which policies are ahead of the one that a table compares with, and which events cost too much."""
     tests = [(table, test) for table in tables for test in table["tests"]]
-    falls = [(table, fall) for table in tables for fall in table["falls"] if fall.get("margin")]
-    if not tests and not falls:
-        return []
-    lines = []
-    for table, test in tests:
-        if test["pc_difference"] > 0.0:
-            shown = "better" if test["differs"] else "ahead, which is not shown to be more than chance"
-            lines.append(
-                f"- {table['title']}: `{test['policy']}` is {shown}, against `{table['against']}` on {test['evaluation']} "
-                f"({_trained_on(table, test)}): {_difference(test)[0]} points."
-            )
-    for table, fall in falls:
-        if fall["within"] != "yes":
-            told = (
-                "success falls by more than"
-                if fall["within"] == "no"
-                else "it is not shown that success falls by at most"
-            )
-            lines.append(
-                f"- {table['title']}: `{fall['policy']}` on {fall['evaluation']} ({_trained_on(table, fall)}): {told} "
-                f"{fall['margin']:g} points: {_difference(fall)[0]}."
-            )
-    order = {"better": 0, "falls by more": 1}
-    lines.sort(key=lambda line: min([rank for words, rank in order.items() if words in line], default=2))
-    return [
-        "## Where it loses",
-        "\n".join(lines) or "No other policy is ahead, and no event costs more than its margin.",
-    ]
+    falls = [(table, fall) for table in tables for fall in table["falls"]]
+    lines = [_ahead(table, test) for table, test in tests if test["pc_difference"] > 0.0]
+    lines += [_too_much(table, fall) for table, fall in falls if _costs(fall)]
+    lines.sort(key=lambda line: line[0])
+    if not lines and tests:
+        lines.append((2, "No policy is ahead of the one that it is compared with."))
+    if not any(_costs(fall) for _, fall in falls) and falls:
+        lines.append((2, "No event costs more than it may."))
+    return ["## Who is ahead, and what costs too much", "\n".join(f"- {line}" for _, line in lines)] if lines else []
 
 
-def _trained_on(table: Mapping[str, Any], test: Mapping[str, Any]) -> str:
-    minutes = f", {_minutes(test['minutes'])} minutes" if test["minutes"] else ""
-    return f"trained on {test['demonstrations']} of {test['data']}{minutes}"
+def _ahead(table: Mapping[str, Any], test: Mapping[str, Any]) -> tuple[int, str]:
+    """Rank and words of a policy that succeeds more often than the one that it is compared with."""
+    other = (
+        ""
+        if test["minutes"] == test["against_minutes"]
+        else f", the other for {_minutes(test['against_minutes'])} minutes"
+    )
+    where = f"`{table['against']}` on {test['evaluation']} ({_trained_on(test)}{other}): {_difference(test)[0]} points"
+    if test["differs"]:
+        return 0, f"{table['title']}: `{test['policy']}` is better than {where}."
+    return 1, f"{table['title']}: `{test['policy']}` is ahead of {where}; this may be chance."
+
+
+def _costs(fall: Mapping[str, Any]) -> bool:
+    """Whether success falls by more than it may, or might; without a margin, by more than chance."""
+    if fall.get("margin"):
+        return bool(fall["within"] != "yes")
+    return bool(fall["differs"] and fall["pc_difference"] < 0.0)
+
+
+def _too_much(table: Mapping[str, Any], fall: Mapping[str, Any]) -> tuple[int, str]:
+    """Rank and words of an event after which success falls too much."""
+    told = {
+        "no": f"success falls by more than {fall.get('margin', 0):g} points",
+        "not shown": f"it is not shown that success falls by at most {fall.get('margin', 0):g} points",
+    }.get(fall.get("within", ""), "success falls")
+    where = f"{table['title']}: `{fall['policy']}` on {fall['evaluation']} ({_trained_on(fall)})"
+    return int(fall.get("within") == "not shown"), f"{where}: {told}: {_difference(fall)[0]}."
+
+
+def _trained_on(test: Mapping[str, Any]) -> str:
+    minutes = f" for {_minutes(test['minutes'])} minutes" if test["minutes"] else ""
+    return f"trained{minutes} on {test['demonstrations']} of {test['data']}"
 
 
 def _about_seeds(results: Mapping[str, Any]) -> list[str]:
@@ -184,8 +195,8 @@ def _by_primitive(table: Mapping[str, Any]) -> list[str]:
     listed = "; ".join(f"{phase}: {', '.join(primitives)}" for phase, primitives in phases.items())
     told = (
         "How far the hands are from the noise-free expert's, by the expert's primitive, cm: the mean over the seeds that the "
-        "expert solves, without those whose episode ended before. Several trainings: their mean and, in brackets, range."
-        + (f" Primitives of a phase count alike: {listed}." if together else "")
+        "expert solves, without those whose episode ended before that primitive began. Several trainings: "
+        "their mean and, in brackets, range." + (f" Primitives of a phase count alike: {listed}." if together else "")
     )
     return [told, markdown_table(heads, lines)]
 
@@ -253,8 +264,8 @@ def _what_differs(table: Mapping[str, Any], tests: Sequence[Mapping[str, Any]], 
     """What :func:`_difference` tells, in words."""
     several = len(table["training_seeds"]) > 1
     interval = (
-        "the least that holds the two-level bootstrap's over trainings and seeds, Student's over trainings, and Newcombe's for "
-        "one pair of trainings in the mean"
+        "the smallest that contains the two-level bootstrap's over trainings and seeds, Student's over trainings, and Newcombe's "
+        "for one pair of trainings in the mean"
         if several
         else "Newcombe, over seeds"
     )
@@ -298,13 +309,15 @@ def _failures(table: Mapping[str, Any]) -> list[str]:
                 minutes = f", {_minutes(row['minutes'])} minutes" if row["minutes"] else ""
                 lines.append(
                     f"- `{row['policy']}` ({row['data']}, {row['demonstrations']} demonstrations{minutes}, training seed "
-                    f"{run['training_seed']}) on {name}: {', '.join(map(str, seeds[:LISTED]))}{rest}"
+                    f"{run['training_seed']}) on {name}, `{_root(run['command'], '--output_dir=').parent}`: "
+                    f"{', '.join(map(str, seeds[:LISTED]))}{rest}"
                 )
     if not lines:
         return []
     told = (
-        "A recording for Rerun shows why an episode failed: run the evaluation's command, above, with these options at its end, "
-        "`--seed=SEED --num_episodes=1 --rerun=failures --output_dir=FOLDER`. All failed seeds are in the JSON beside this page."
+        "A recording for Rerun shows how an episode failed: run the evaluation's command, above, with these options at its end, "
+        "`--seed=SEED --num_episodes=1 --rerun=failures --output_dir=FOLDER`. All failed seeds are in the JSON beside this page. "
+        "Who changes something after a look at them needs other seeds for the next report."
     )
     return [
         "<details><summary>Failed seeds of this table</summary>\n\n" + "\n".join([told, "", *lines]) + "\n\n</details>"
@@ -325,7 +338,7 @@ def _commands(table: Mapping[str, Any]) -> str:
     return "<details><summary>Commands of this table</summary>\n\n```\n" + "\n".join(found) + "\n```\n\n</details>"
 
 
-def _root(command: str) -> Path:
-    """The data set that a training learned from."""
-    (root,) = (word.partition("=")[2] for word in shlex.split(command) if word.startswith("--dataset.root="))
+def _root(command: str, option: str = "--dataset.root=") -> Path:
+    """The data set that a training learned from, or another folder in a command."""
+    (root,) = (word.removeprefix(option) for word in shlex.split(command) if word.startswith(option))
     return Path(root)

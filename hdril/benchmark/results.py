@@ -184,9 +184,10 @@ def _run(step: Evaluate, store: Store) -> dict[str, Any]:
             f"{done.output} is no evaluation on held-out seeds: {results['held_out_basis'] or 'that was not checked'}"
         )
     interval = wilson_interval(results["n_success"], results["n_episodes"])
+    telling = any(episode["primitives"] for episode in results["per_episode"])
     noticed = [episode["success"] for episode in results["per_episode"] if episode["noticed"]]
     return {key: results[key] for key in _KEPT} | {
-        "pc_noticed": 100.0 * len(noticed) / results["n_episodes"],
+        "pc_noticed": 100.0 * len(noticed) / results["n_episodes"] if telling else None,
         "pc_success_noticed": 100.0 * sum(noticed) / len(noticed) if noticed else None,
         "pc_success_ci95": [100.0 * bound for bound in interval],
         "training_seed": step.policy.seed,

@@ -126,7 +126,7 @@ def bootstrap_difference(
 
     Trainings of each policy are drawn anew with replacement, and so are seeds, the same for both policies: a two-level
     bootstrap. Davison and Hinkley (1997), *Bootstrap Methods and their Application*, section 3.8. With few trainings it is too
-    narrow: two or three show hardly more of how trainings differ than one does. :func:`difference_over_trainings` is not.
+    narrow: two or three show hardly more of how trainings differ than one does. :func:`difference_over_trainings` mends that.
 
     Args:
         first: (trainings, seeds) outcomes.
@@ -161,8 +161,9 @@ def student_difference(
 ) -> tuple[float, float]:
     """Student's interval for the difference of two mean success rates over trainings, the seeds being given, in [-1, 1].
 
-    It takes the success rates of trainings as normal, and as spread alike for both policies. So it is exact for equal methods,
-    however few their trainings. The arguments are those of :func:`bootstrap_difference`; at least two trainings of each.
+    It takes the success rates of trainings as normal, and as spread alike for both policies. For equal methods of which this is
+    true it is exact on these seeds, however few the trainings. The arguments are those of :func:`bootstrap_difference`; at least
+    two trainings of each.
     """
     from statsmodels.stats.weightstats import CompareMeans, DescrStatsW
 
@@ -184,7 +185,7 @@ def difference_over_trainings(
 ) -> tuple[float, float]:
     """Interval for the difference of two mean success rates, in [-1, 1], from as many trainings of each policy.
 
-    One training has that of :func:`paired_difference_interval`. Several have the least that holds these three: that of
+    One training has that of :func:`paired_difference_interval`. Several have the smallest that contains these three: that of
     :func:`bootstrap_difference`; :func:`student_difference`, because the bootstrap is too narrow where trainings are few; and
     the mean one of the pairs of trainings, because the bootstrap is a single number where all succeed on all seeds, although so
     many seeds leave a difference of some points open. The arguments are those of :func:`bootstrap_difference`.

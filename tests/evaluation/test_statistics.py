@@ -174,6 +174,8 @@ def test_the_same_trainings_are_drawn_for_both_at_once() -> None:
     apart, together = (difference_over_trainings(second, first, same_trainings=same) for same in (False, True))
     assert apart[1] - apart[0] > 0.3
     assert together[1] - together[0] < 0.12
+    surer = difference_over_trainings(second, first, confidence=0.5)
+    assert surer[1] - surer[0] < (apart[1] - apart[0]) / 2
     assert together[0] <= second.mean() - first.mean() <= together[1]
     assert bootstrap_difference(second, first, same_trainings=True)[1] < 0.0, "no training gains"
     with pytest.raises(ValueError, match=r"the same trainings must be as many, got 3 and 2"):
