@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import time
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -43,17 +42,34 @@ class Progress:
     """Steps at a time."""
     fresh: bool = False
     """Whether the step that is told of was done just now, and not before."""
-    seconds: dict[str, list[float]] = field(default_factory=dict)
-    """How long steps of each kind took."""
-    left: dict[str, int] = field(default_factory=dict)
-    """How many steps of each kind are left."""
+    done: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """By unit (:attr:`Step.effort`): how much is done, and the seconds that it took."""
+    left: dict[str, float] = field(default_factory=dict)
+    """By unit: how much is left."""
+
+    @staticmethod
+    def of(steps: Iterable[Step], jobs: int) -> Progress:
+        """Nothing of the steps is done."""
+        progress = Progress(jobs)
+        for step in steps:
+            unit, effort = step.effort
+            progress.left[unit] = progress.left.get(unit, 0.0) + effort
+        return progress
+
+    def settle(self, step: Step, seconds: float | None) -> None:
+        """A step is done, which took so long, or cannot be done (None)."""
+        unit, effort = step.effort
+        self.left[unit] -= effort
+        if seconds is not None:
+            before, took = self.done.get(unit, (0.0, 0.0))
+            self.done[unit] = (before + effort, took + seconds)
 
     def remaining(self) -> float | None:
-        """Seconds until all is done, by the mean of each kind; None while there is a kind of which nothing is known."""
-        if any(count and not self.seconds.get(kind) for kind, count in self.left.items()):
+        """Seconds until all is done, by the mean speed of each unit; None while there is a unit of which nothing is known."""
+        waiting = {unit: effort for unit, effort in self.left.items() if effort > 0.0}
+        if not waiting.keys() <= self.done.keys():
             return None
-        means = {kind: sum(took) / len(took) for kind, took in self.seconds.items() if took}
-        return sum(count * means[kind] for kind, count in self.left.items() if count) / self.jobs
+        return sum(effort * self.done[unit][1] / self.done[unit][0] for unit, effort in waiting.items()) / self.jobs
 
 
 Watch = Callable[[Step, Progress], object]
@@ -84,7 +100,7 @@ class Engine:
             UserError: steps failed; names them, and where the log of the first is.
         """
         left = in_order(steps)
-        progress = Progress(self._jobs, left=dict(Counter(step.kind for step in left)))
+        progress = Progress.of(left, self._jobs)
         try:
             left = self._settle(left, progress)
             progress.fresh = True
@@ -113,12 +129,11 @@ class Engine:
         for step in left:
             if step in busy or (done := self._store.find(step)) is None:
                 if any(other in self._failed for other in in_order([step])):
-                    progress.left[step.kind] -= 1
+                    progress.settle(step, None)
                 else:
                     still.append(step)
                 continue
-            progress.left[step.kind] -= 1
-            progress.seconds.setdefault(step.kind, []).append(done.seconds)
+            progress.settle(step, done.seconds)
             self._watch(step, progress)
         return still
 

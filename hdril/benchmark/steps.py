@@ -60,6 +60,11 @@ class Step(ABC):
         """The steps whose results it is made from, by names."""
         return {}
 
+    @property
+    def effort(self) -> tuple[str, float]:
+        """In which unit its work is counted, and how much it is."""
+        return self.kind, 1.0
+
     @abstractmethod
     def settings(self) -> dict[str, Any]:
         """All that decides the result, the inputs aside, as JSON: options, and the versions of the software."""
@@ -92,6 +97,10 @@ class Record(Step):
     @property
     def title(self) -> str:
         return f"{self.episodes} demonstrations of {self.task}"
+
+    @property
+    def effort(self) -> tuple[str, float]:
+        return f"demonstrations of {base_name(self.task)}", self.episodes
 
     def settings(self) -> dict[str, Any]:
         return dict(vars(self)) | {"software": recording_software(base_name(self.task))}
@@ -139,6 +148,10 @@ class Train(Step):
     def title(self) -> str:
         budget = f", {self.minutes:g} minutes" if self.minutes else ""
         return f"{self.name} on {self.data.episodes} of {self.data.task}{budget}, seed {self.seed}"
+
+    @property
+    def effort(self) -> tuple[str, float]:
+        return ("minutes of training", self.minutes) if self.minutes else ("steps of training", self.steps)
 
     @property
     def inputs(self) -> Mapping[str, Step]:
@@ -281,6 +294,10 @@ class Evaluate(Step):
     @property
     def title(self) -> str:
         return f"{self.policy.title}: {self.name}"
+
+    @property
+    def effort(self) -> tuple[str, float]:
+        return f"episodes of {base_name(self.task)}", self.episodes
 
     @property
     def seeds(self) -> range:

@@ -17,6 +17,7 @@ from hdril.benchmark.check import check
 from hdril.benchmark.engine import Engine, Progress, in_order
 from hdril.benchmark.matrix import Matrix, all_steps
 from hdril.benchmark.page import write_report
+from hdril.benchmark.perform import is_running
 from hdril.benchmark.results import collect, keep_tables
 from hdril.benchmark.steps import Step
 from hdril.benchmark.store import Store
@@ -24,7 +25,7 @@ from hdril.cli.common import run
 from hdril.cli.shards import log_folder
 from hdril.evaluation.checkpoint import read_json
 from hdril.execution import SlurmConfig, check_execution, submit_to_slurm
-from hdril.files import LOCK
+from hdril.files import LOCK, is_busy
 
 
 @dataclass
@@ -81,7 +82,7 @@ def benchmark_command(config: BenchmarkConfig) -> None:
     _report_before(config)  # what is wrong with it is told before anything is done
     store, wanted = Store(config.store), all_steps(config.chosen)
     if config.plan:
-        _print_plan(store, wanted)
+        _print_plan(store, wanted, config.jobs)
         return
     if config.executor == "slurm":
         _submit(config)
@@ -146,17 +147,23 @@ def _do_steps(config: BenchmarkConfig, rank: int, world_size: int) -> None:
 
 
 def _in_words(seconds: float) -> str:
-    return f"{seconds / 60.0:.0f} minutes" if seconds < 7200 else f"{seconds / 3600.0:.1f} hours"
+    return f"{max(seconds / 60.0, 1.0):.0f} min" if seconds < 7200 else f"{seconds / 3600.0:.1f} h"
 
 
-def _print_plan(store: Store, wanted: Sequence[Step]) -> None:
+def _print_plan(store: Store, wanted: Sequence[Step], jobs: int) -> None:
+    """Each step: done, and in what time; running, in this command or another; or left. And how long what is left may take."""
     ordered = in_order(wanted)
+    progress = Progress.of(ordered, jobs)
     for step in ordered:
-        done = store.find(step)
-        print(
-            f"{'done' if done else 'left':5} {step.kind:9} {step.title}" + (f" ({done.seconds:.0f} s)" if done else "")
-        )
-    print(f"{sum(store.find(step) is not None for step in ordered)} of {len(ordered)} steps are done")
+        done, place = store.find(step), store.place(step)
+        running = place is not None and place.exists() and (is_busy(place) or is_running(place))
+        word = "done" if done else "running" if running else "left"
+        print(f"{word:7} {step.kind:9} {step.title}" + (f" ({done.seconds:.0f} s)" if done else ""))
+        if done:
+            progress.settle(step, done.seconds)
+    seconds = progress.remaining()
+    rest = f"; about {_in_words(seconds)} are left" if seconds else ""
+    print(f"{sum(store.find(step) is not None for step in ordered)} of {len(ordered)} steps are done{rest}")
 
 
 def main() -> None:

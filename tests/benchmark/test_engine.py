@@ -20,7 +20,7 @@ import psutil
 import pytest
 
 from hdril.benchmark.engine import Engine, Progress, in_order
-from hdril.benchmark.steps import Step
+from hdril.benchmark.steps import Evaluate, Record, Step, Train
 from hdril.benchmark.store import Store, checkout_commit
 from hdril.errors import UserError
 from tests.benchmark.made_up import PROGRAM, Words
@@ -129,13 +129,21 @@ def test_as_many_at_a_time_as_allowed(store: Store, count: Path) -> None:
     assert 1 < max(seen) <= 3
 
 
-def test_what_is_left_is_shared_by_the_jobs() -> None:
-    progress = Progress(
-        2, seconds={"train": [90.0, 110.0], "record": [10.0]}, left={"train": 3, "record": 2, "play": 0}
-    )
-    assert progress.remaining() == pytest.approx((3 * 100.0 + 2 * 10.0) / 2)
-    progress.left["evaluate"] = 1
-    assert progress.remaining() is None, "nothing is known of evaluations"
+def test_what_is_left_is_shared_by_the_jobs_and_counts_by_its_size() -> None:
+    """100 episodes in 50 s, and 10 minutes in 600: 300 episodes and 60 minutes are left."""
+    record, options = Record("table_lift", 10), {"config": Path("c.yaml"), "options": (), "steps": 0, "seed": 1}
+    short, long = (Train("act", record, minutes=minutes, **options) for minutes in (10.0, 60.0))
+    few, many = (Evaluate("nominal", short, "table_lift:yaw=3", episodes, 5) for episodes in (100, 300))
+    progress = Progress.of([record, short, long, few, many], 2)
+    assert progress.remaining() is None, "nothing is known yet"
+    for step, seconds in ((record, 20.0), (few, 50.0), (short, 600.0)):
+        progress.settle(step, seconds)
+    assert progress.remaining() == pytest.approx((150.0 + 3600.0) / 2)
+    progress.settle(long, None)
+    assert progress.remaining() == pytest.approx(75.0), "what cannot be done takes no time"
+    other = Progress.of([many, Train("act", record, **options | {"steps": 9})], 1)
+    other.settle(many, 30.0)
+    assert other.remaining() is None, "of steps, nothing is known"
 
 
 def test_a_step_has_one_thread_and_says_what_did_it(store: Store, count: Path) -> None:

@@ -33,6 +33,7 @@ from hdril.demonstrations.read import read_episode
 from hdril.digest import digest_json
 from hdril.evaluation.results import Run, summarise
 from hdril.execution import SlurmConfig
+from hdril.files import exclusively
 from tests.evaluation.checkpoints import save_hdril
 from tests.evaluation.synthetic import outcome
 from tests.fake_slurm import FakeSlurm
@@ -1370,10 +1371,23 @@ def test_the_command_plans_and_reports_without_doing_what_is_done(
     config = BenchmarkConfig(**vars(matrix), store=tmp_path / "store", document=tmp_path / "report", plan=True)
     benchmark_command(config)
     told = capsys.readouterr().out
-    assert "left  record    50 demonstrations of table_lift:level=varied" in told
-    assert "0 of 13 steps are done" in told
+    assert "left    record    50 demonstrations of table_lift:level=varied" in told
+    assert told.endswith("0 of 13 steps are done\n")
     assert not (tmp_path / "store").exists()
-    pretend(Store(tmp_path / "store"), matrix, fails)
+    store = Store(tmp_path / "store")
+    pretend(store, matrix, fails)
+    *_, last = steps(matrix)
+    folder = store.get(last).output.parent
+    shutil.rmtree(folder)
+    benchmark_command(replace(config, jobs=2))
+    told = capsys.readouterr().out.splitlines()
+    assert told[-1] == "12 of 13 steps are done; about 1 min are left"  # 90 s like the others, by two
+    assert "done    record    50 demonstrations of table_lift:level=varied (90 s)" in told
+    with exclusively(folder, "a test"):
+        benchmark_command(config)
+    assert f"running evaluate  {last.title}" in capsys.readouterr().out
+    shutil.rmtree(store.folder)
+    pretend(store, matrix, fails)
     monkeypatch.setattr("hdril.benchmark.engine.start", None)  # doing a step would fail
     benchmark_command(replace(config, plan=False))
     assert json.loads((tmp_path / "report.json").read_text())["name"] == "test"
