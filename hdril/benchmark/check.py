@@ -228,8 +228,10 @@ def _check_table(matrix: Matrix, table: TableSpec) -> None:
 
 def _check_by_primitive(matrix: Matrix, table: TableSpec) -> None:
     """The table of errors by primitive; numbers of others must be in one of its columns."""
-    if (table.phases or table.published_by_primitive) and not table.by_primitive:
-        raise ValueError(f"table {table.title!r}: phases and published_by_primitive need by_primitive=true")
+    if not table.by_primitive:
+        if table.phases or table.published_by_primitive:
+            raise ValueError(f"table {table.title!r}: phases and published_by_primitive need by_primitive=true")
+        return
     labels = get_task(matrix.data[table.data[0]].task).labels
     for phase, primitives in table.phases.items():
         if unknown := [name for name in primitives if name not in labels]:

@@ -51,14 +51,14 @@ def _losses(tables: Sequence[Mapping[str, Any]]) -> list[str]:
     """Before all else: which policies are ahead of the one that a table compares with, and which events cost too much."""
     tests = [(table, test) for table in tables for test in table["tests"]]
     falls = [(table, fall) for table in tables for fall in table["falls"]]
-    lines = [_ahead(table, test) for table, test in tests if test["pc_difference"] > 0.0]
-    lines += [_too_much(table, fall) for table, fall in falls if _costs(fall)]
-    lines.sort(key=lambda line: line[0])
-    if not lines and tests:
-        lines.append((2, "No policy is ahead of the one that it is compared with."))
-    if not any(_costs(fall) for _, fall in falls) and falls:
-        lines.append((2, "No event costs more than it may."))
-    return ["## Who is ahead, and what costs too much", "\n".join(f"- {line}" for _, line in lines)] if lines else []
+    ahead = [_ahead(table, test) for table, test in tests if test["pc_difference"] > 0.0]
+    costs = [_too_much(table, fall) for table, fall in falls if _costs(fall)]
+    lines = [line for _, line in sorted([*ahead, *costs], key=lambda line: line[0])]
+    if tests and not ahead:
+        lines.append("No policy is ahead of the one that it is compared with.")
+    if falls and not costs:
+        lines.append("No event costs more than it may.")
+    return ["## Who is ahead, and what costs too much", "\n".join(f"- {line}" for line in lines)] if lines else []
 
 
 def _ahead(table: Mapping[str, Any], test: Mapping[str, Any]) -> tuple[int, str]:
@@ -91,9 +91,10 @@ def _too_much(table: Mapping[str, Any], fall: Mapping[str, Any]) -> tuple[int, s
     return int(fall.get("within") == "not shown"), f"{where}: {told}: {_difference(fall)[0]}."
 
 
-def _trained_on(test: Mapping[str, Any]) -> str:
-    minutes = f" for {_minutes(test['minutes'])} minutes" if test["minutes"] else ""
-    return f"trained{minutes} on {test['demonstrations']} of {test['data']}"
+def _trained_on(row: Mapping[str, Any]) -> str:
+    """How the policy of a row, a test or a fall was trained."""
+    minutes = f" for {_minutes(row['minutes'])} minutes" if row["minutes"] else ""
+    return f"trained{minutes} on {row['demonstrations']} of {row['data']}"
 
 
 def _about_seeds(results: Mapping[str, Any]) -> list[str]:
@@ -306,11 +307,9 @@ def _failures(table: Mapping[str, Any]) -> list[str]:
             for run in (run for run in runs if run["failed_seeds"]):
                 seeds = run["failed_seeds"]
                 rest = f" and {len(seeds) - LISTED} more" if len(seeds) > LISTED else ""
-                minutes = f", {_minutes(row['minutes'])} minutes" if row["minutes"] else ""
                 lines.append(
-                    f"- `{row['policy']}` ({row['data']}, {row['demonstrations']} demonstrations{minutes}, training seed "
-                    f"{run['training_seed']}) on {name}, `{_root(run['command'], '--output_dir=').parent}`: "
-                    f"{', '.join(map(str, seeds[:LISTED]))}{rest}"
+                    f"- `{row['policy']}` ({_trained_on(row)}, training seed {run['training_seed']}) on {name}, "
+                    f"`{_folder(run['command'], '--output_dir=').parent}`: {', '.join(map(str, seeds[:LISTED]))}{rest}"
                 )
     if not lines:
         return []
@@ -332,13 +331,15 @@ def _commands(table: Mapping[str, Any]) -> str:
         for command in row["training_commands"]:
             record = Record(spec["task"], row["demonstrations"], spec["seed"], spec["perturb"], spec["stray"])
             # Older reports did not keep this command.
-            found[row.get("record_command") or shlex.join(record.command(_root(command), {}))] = None
+            found[row.get("record_command") or shlex.join(record.command(_folder(command, "--dataset.root="), {}))] = (
+                None
+            )
             found[command] = None
         found |= dict.fromkeys(run["command"] for runs in row["cells"].values() for run in runs)
     return "<details><summary>Commands of this table</summary>\n\n```\n" + "\n".join(found) + "\n```\n\n</details>"
 
 
-def _root(command: str, option: str = "--dataset.root=") -> Path:
-    """The data set that a training learned from, or another folder in a command."""
-    (root,) = (word.removeprefix(option) for word in shlex.split(command) if word.startswith(option))
-    return Path(root)
+def _folder(command: str, option: str) -> Path:
+    """The folder that a command gives to an option."""
+    (folder,) = (word.removeprefix(option) for word in shlex.split(command) if word.startswith(option))
+    return Path(folder)

@@ -154,16 +154,19 @@ def _print_plan(store: Store, wanted: Sequence[Step], jobs: int) -> None:
     """Each step: done, and in what time; running, in this command or another; or left. And how long what is left may take."""
     ordered = in_order(wanted)
     progress = Progress.of(ordered, jobs)
+    count = 0
     for step in ordered:
-        done, place = store.find(step), store.place(step)
-        running = place is not None and place.exists() and (is_busy(place) or is_running(place))
-        word = "done" if done else "running" if running else "left"
-        print(f"{word:7} {step.kind:9} {step.title}" + (f" ({done.seconds:.0f} s)" if done else ""))
-        if done:
+        if done := store.find(step):
+            count += 1
             progress.settle(step, done.seconds)
+            print(f"done    {step.kind:9} {step.title} ({done.seconds:.0f} s)")
+            continue
+        place = store.place(step)
+        running = place is not None and place.exists() and (is_busy(place) or is_running(place))
+        print(f"{'running' if running else 'left':7} {step.kind:9} {step.title}")
     seconds = progress.remaining()
     rest = f"; about {_in_words(seconds)} are left" if seconds else ""
-    print(f"{sum(store.find(step) is not None for step in ordered)} of {len(ordered)} steps are done{rest}")
+    print(f"{count} of {len(ordered)} steps are done{rest}")
 
 
 def main() -> None:

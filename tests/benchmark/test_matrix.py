@@ -728,14 +728,14 @@ def test_failed_seeds_are_listed_with_a_way_to_see_them(tmp_path: Path) -> None:
     first = ", ".join(str(SEED + number) for number in range(5))
     folder = store.relative(str(store.get(steps(matrix)[0]).output.parent))
     assert listed[0] == (
-        f"- `linear` (varied, 50 demonstrations, training seed 1) on varied, `{folder}`: {first} and {COUNT - 5} more"
+        f"- `linear` (trained on 50 of varied, training seed 1) on varied, `{folder}`: {first} and {COUNT - 5} more"
     )
     assert "`--seed=SEED --num_episodes=1 --rerun=failures --output_dir=FOLDER`" in text
     store = Store(tmp_path / "five")
     matrix = changed(by_minutes)
     pretend(store, matrix, lambda step: set(range(SEED, SEED + 5)) if step.policy.name == "act" else set())
     text = markdown(collect(matrix, store))
-    assert "- `act` (varied, 50 demonstrations, 60 minutes, training seed 2) on varied, `STORE/" in text
+    assert "- `act` (trained for 60 minutes on 50 of varied, training seed 2) on varied, `STORE/" in text
     assert f", {SEED + 4}\n" in text
     assert "more\n" not in text
     store, matrix = Store(tmp_path / "another"), changed(one_row)
