@@ -46,7 +46,7 @@ class BenchmarkConfig(Matrix):
     jobs: int = field(default_factory=lambda: os.cpu_count() or 1)
     """Steps at a time; each has one thread."""
     plan: bool = False
-    """Do nothing: print what is done and what is left."""
+    """Do nothing: print what is done, what runs and what is left."""
     executor: str = "local"
     """Who does the steps: local, this machine; slurm, jobs of a Slurm cluster, and this command ends when they are submitted.
     The disk must be shared."""

@@ -52,6 +52,21 @@ def test_a_figure_that_misses_its_limit_says_so(value: float, at_least: bool, ve
     assert str(Figure("speed", value, 2.0, at_least, "times")) == f"{verdict}  speed: {value:.2f} times ({bound})"
 
 
+@pytest.mark.parametrize(
+    ("task", "name"),
+    [
+        ("table_lift:level=hard", "table_lift"),
+        ("peg_in_hole", "peg_in_hole"),
+        ("handover", "hard"),
+        ("clear_and_lift", "hard"),
+    ],
+)
+def test_every_task_has_a_file_to_train_with(task: str, name: str) -> None:
+    path = bench._training_config(task)
+    assert path.stem == name
+    assert (Path(__file__).parents[2] / path).exists()
+
+
 @pytest.mark.long
 def test_every_figure_is_measured(capsys) -> None:
     bench_command(BenchConfig(episodes=2, train_steps=20))
