@@ -66,7 +66,8 @@ def _picture(figure: Figure, kind: str) -> bytes:
     import matplotlib
 
     buffer = io.BytesIO()
-    with matplotlib.rc_context({"svg.hashsalt": "hdril", "svg.fonttype": "path"}):
+    # Letters stay text: as outlines they are most of a page's bytes, and cannot be searched or read aloud.
+    with matplotlib.rc_context({"svg.hashsalt": "hdril", "svg.fonttype": "none"}):
         figure.savefig(buffer, format=kind, dpi=110, metadata={"Date": None} if kind == "svg" else {"Software": None})
     return buffer.getvalue()
 
