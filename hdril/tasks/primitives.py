@@ -87,6 +87,9 @@ class Primitive:
     needs: tuple[Need, ...] = ()
     unless: Need | None = None
     before: tuple[Need, ...] | None = None
+    keeps: Callable[[Scene, str], bool] | None = None
+    """Whether a hand (scene, side) stays as it was told to be, for the whole primitive, because of what it holds where the
+    primitive begins."""
 
     @property
     def frames(self) -> int:
@@ -152,6 +155,8 @@ class Plan:
     def __init__(self, primitive: Primitive, scene: Scene, noise: Noise, rng: np.random.Generator) -> None:
         self.primitive = primitive
         self._scene = scene
+        # Once and for all: a hand that changed its mind would be neither a demonstration of keeping nor one of letting go.
+        self._kept = {side: scene.hands[side] for side in SIDES if primitive.keeps and primitive.keeps(scene, side)}
         offsets = [_offsets(segment, noise, rng) for segment in primitive.segments]
         self._offsets = {side: np.concatenate([each[side] for each in offsets]) for side in SIDES}
         self._frame = 0
@@ -193,7 +198,7 @@ class Plan:
             if first >= segment.frames:
                 first -= segment.frames
                 continue
-            goal, done = segment.goal(self._scene), _ease(first / segment.frames)
+            goal, done = segment.goal(self._scene) | self._kept, _ease(first / segment.frames)
             for i in range(first, segment.frames):
                 fraction = (_ease((i + 1) / segment.frames) - done) / (1.0 - done)
                 poses = {side: interpolate(start[side].pose, goal[side].pose, fraction) for side in SIDES}
@@ -315,19 +320,6 @@ def hands_at(opening: float, back_off: float = 0.0, rise: float = 0.0) -> Callab
         }
 
     return goal
-
-
-def keeping(primitive: Primitive, keeps: Callable[[Scene, str], bool]) -> Primitive:
-    """The primitive, but a hand (scene, side) that ``keeps`` what it holds stays as it was told to be."""
-
-    def kept(segment: Segment) -> Segment:
-        def goal(scene: Scene) -> Hands:
-            goals = segment.goal(scene)
-            return {side: scene.hands[side] if keeps(scene, side) else hand for side, hand in goals.items()}
-
-        return replace(segment, goal=goal)
-
-    return replace(primitive, segments=tuple(kept(segment) for segment in primitive.segments))
 
 
 # ---------------------------------------------------------------------- constructors
