@@ -423,3 +423,25 @@ def test_a_plan_follows_an_object_that_turns(degrees: float, again: bool, sign: 
     plan.follow(replace(SCENE, objects=SCENE.objects | {body: turned}))
     rows = np.stack([plan.next() for _ in range(plan.primitive.frames)])
     assert again != np.array_equal(rows, waypoints(plan.primitive))
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_hand_that_is_kept_stays_so_whatever_moves(kept: bool) -> None:
+    """Whether a hand keeps hold is decided where a primitive begins: no demonstration lets go half-way."""
+    body = next(iter(SCENE.objects))
+    pose = SCENE.objects[body]
+    grips = dict.fromkeys(SIDES, Grip(body, Pose((0.1, 0.0, 0.0))))
+
+    def keeps(scene: Scene, side: str) -> bool:
+        return side == "left" and (scene.objects[body].position[2] == pose.position[2]) == kept
+
+    plan = Plan(replace(reach("reach", grips), keeps=keeps), SCENE, QUIET, np.random.default_rng(0))
+    plan.next()
+    moved = replace(SCENE, objects=SCENE.objects | {body: pose.translated((0.0, 0.0, 0.1))})
+    plan.follow(moved)
+    rows = np.stack([plan.next() for _ in range(plan.primitive.frames - 1)])
+    last = split_action(rows[-1])
+    goal = grips["right"].tool(moved).translated((0.0, 0.0, 0.12))
+    assert last["right"].pose.position == pytest.approx(goal.position)
+    assert last["left"].pose.position == pytest.approx((SCENE.hands["left"].pose if kept else goal).position)
+    assert (np.ptp(rows[:, :8], axis=0).max() == 0.0) == kept
