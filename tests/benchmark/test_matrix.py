@@ -1354,6 +1354,7 @@ def test_the_page_holds_all_that_it_shows(tmp_path: Path) -> None:
     assert "![Lift](test_lift_success.png)" in text
     assert page.count("<svg") == 2
     assert "<img" not in page
+    assert re.search(r"<text[^>]*>success, %</text>", page), "letters in pictures are text"
     assert "<table>" in page
     parts = re.findall(r' id="([^"]+)"', page)
     assert len(parts) == len(set(parts)), "names of parts are unique"

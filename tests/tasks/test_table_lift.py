@@ -28,6 +28,7 @@ from hdril.tasks.table_lift import (
     goal_x,
     goal_y,
 )
+from hdril.tasks.task import Task
 from tests.tasks.waypoints import waypoints
 
 SIGNS = dict(zip(SIDES, (1.0, -1.0), strict=True))
@@ -178,6 +179,21 @@ def test_a_hand_that_alone_holds_a_raised_table_keeps_it(lost: str) -> None:
     assert hand.opening == 0.0
     assert hand.pose.position == pytest.approx(raised.hands[kept].pose.position)
     assert _after(0, raised)[lost].opening == 1.0
+
+
+@pytest.mark.parametrize("lost", SIDES)
+@pytest.mark.parametrize("task", [TASK, get_task("clear_and_lift")], ids=lambda task: task.name)
+def test_from_the_first_frame_to_the_last_a_kept_hand_stays_as_it_was(task: Task, lost: str) -> None:
+    """Where the expert tries a grasp again, it opens the other hand, goes back with it, and grasps."""
+    raised = _with_open_hand(lost, scene(at=(0.8, 0.0, 0.1)))
+    (kept,) = set(SIDES) - {lost}
+    columns = slice(0, 8) if kept == "left" else slice(8, 16)
+    (retreat,), grasp = task.recovery, next(p for p in task.primitives if p.name == "grasp")
+    for primitive in (retreat, grasp):
+        rows = waypoints(primitive, raised)
+        hand = raised.hands[kept]
+        assert rows[:, columns] == pytest.approx(np.tile([*hand.pose.as_vector(), hand.opening], (len(rows), 1)))
+        assert np.ptp(np.delete(rows, np.arange(16)[columns], axis=1)[:, :3], axis=0).max() > 0.05
 
 
 @pytest.mark.parametrize("lost", SIDES)
