@@ -6,7 +6,7 @@ import html
 import io
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,10 +25,10 @@ _STYLE = (
 )
 
 
-def write_report(document: Path, results: Mapping[str, Any]) -> list[Path]:
+def write_report(document: Path, results: Mapping[str, Any], gone: Iterable[str] = ()) -> list[Path]:
     """Write ``<document>.json``, ``.md`` and ``.html``, and each figure as ``<document>_<table>_<name>.png`` and ``.svg``.
 
-    The page holds everything that it shows. Returns the files.
+    The page holds everything that it shows. Figures of tables that are ``gone``, by title, are removed. Returns the files.
     """
 
     def beside(suffix: str) -> Path:
@@ -47,6 +47,10 @@ def write_report(document: Path, results: Mapping[str, Any]) -> list[Path]:
     files[beside(".html")] = _page(files[beside(".md")].decode(), pictures).encode()
     for path, data in files.items():
         write_atomically(path, lambda file, data=data: file.write(data))
+    for title in gone:
+        for kind in ("png", "svg"):
+            for path in set(document.parent.glob(f"{document.name}_{slug(title)}_*.{kind}")) - files.keys():
+                path.unlink()
     return list(files)
 
 

@@ -101,9 +101,10 @@ def benchmark_command(config: BenchmarkConfig) -> None:
     with FileLock(config.store / LOCK):  # another command may write other tables of the same report
         before = _report_before(config)
         results = keep_tables(config, results, before)
-        write_report(document, results)
-    titles = {table["title"] for table in results["tables"]}
-    if gone := [table["title"] for table in before.get("tables", []) if table["title"] not in titles]:
+        titles = {table["title"] for table in results["tables"]}
+        gone = [table["title"] for table in before.get("tables", []) if table["title"] not in titles]
+        write_report(document, results, gone)
+    if gone:
         print(f"No longer in the report, because they are asked for in another way now: {', '.join(gone)}")
     print(f"Report: {document}.html, and as Markdown beside it")
 

@@ -1452,6 +1452,21 @@ def test_a_report_grows_table_by_table(tmp_path: Path) -> None:
         do(tmp_path, "Peg", "two")
 
 
+@pytest.mark.usefixtures("nothing_is_done")
+def test_a_table_that_goes_takes_its_pictures_along(tmp_path: Path) -> None:
+    do(tmp_path, "Again, nominal", "one")
+    do(tmp_path, "Lift", "two")
+    pictures = {path.name for path in tmp_path.glob("report_*")}
+    assert {"report_lift_success.png", "report_again_nominal_success.svg"} <= pictures
+
+    def asked_anew(values: dict[str, Any]) -> None:
+        two_tables(values)
+        values["tables"][1]["beside"] = ["pc_noticed"]
+
+    assert titles(do(tmp_path, "Lift", "two", asked_anew)) == ["Lift"]
+    assert {path.name for path in tmp_path.glob("report_*")} == {name for name in pictures if "again" not in name}
+
+
 def test_the_tables_of_the_published_page_are_what_the_matrix_asks_for() -> None:
     """A change of the definition, or of what a report needs, would drop rows that took hours."""
     matrix = read(ROOT / "configs/benchmark/suite.yaml")
