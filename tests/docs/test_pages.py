@@ -73,6 +73,39 @@ def test_headline_numbers_are_those_of_the_benchmark() -> None:
                 assert f"| {task}, everything varied | {row['demonstrations']} | {success} |" in readme
 
 
+EVENTS = {
+    "push": "the object is pushed before it is grasped",
+    "push_held": "it is pushed while it is held",
+    "open_hand": "a hand opens for up to half a second",
+    "stop_motor": "a motor stops for up to a second",
+    "platform_slide": "the goal slides",
+    "rack_slide": "the goal slides",
+    "freeze": "the sensor freezes",
+    "repeat": "the sensor shows each third frame alone",
+    "hands_stay": "in the first grasp, the hands stay where they are",
+    "fingers_open": "in the first grasp, the fingers stay open",
+    "hands_high": "in the first grasp, the hands arrive 6 cm too high",
+}
+
+
+def test_what_events_cost_is_what_the_benchmark_found() -> None:
+    """The table of the results, by the data of the page: a column for each task, a row for each event."""
+    tables = json.loads((ROOT / "docs/benchmark/suite.json").read_text())["tables"]
+    text = (ROOT / "docs/results.md").read_text().partition("**Where one thing happens**")[2]
+    header, _, *lines = (line.strip("| ").split(" | ") for line in text[text.index("| |") :].partition("\n\n")[0].splitlines())
+    rows = {name: dict(zip(header, cells, strict=False)) for name, *cells in lines}
+    told = [(table["rows"][0]["cells"], fall) for table in tables for fall in table["falls"]]
+    assert told
+    for cells, fall in told:
+        task, event = fall["evaluation"].split(", ")
+        ((run,), (control,)) = cells[fall["evaluation"]], cells[fall["control"]]
+        low, high = fall["pc_difference_ci95"]
+        column = HEADLINES[task.replace("_", " ").capitalize()]
+        found = f"{run['n_success']} of {run['n_episodes']}, {fall['pc_difference']:+.1f} ({low:+.1f} to {high:+.1f})"
+        assert rows[EVENTS[event]][column] == found
+        assert rows["nothing"][column] == f"{control['n_success']} of {control['n_episodes']}"
+
+
 @each_page
 def test_links_lead_somewhere(page: Path) -> None:
     targets = re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", page.read_text())
