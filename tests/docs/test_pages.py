@@ -92,7 +92,8 @@ def test_what_events_cost_is_what_the_benchmark_found() -> None:
     """The table of the results, by the data of the page: a column for each task, a row for each event."""
     tables = json.loads((ROOT / "docs/benchmark/suite.json").read_text())["tables"]
     text = (ROOT / "docs/results.md").read_text().partition("**Where one thing happens**")[2]
-    header, _, *lines = (line.strip("| ").split(" | ") for line in text[text.index("| |") :].partition("\n\n")[0].splitlines())
+    written = text[text.index("| |") :].partition("\n\n")[0].splitlines()
+    header, _, *lines = (line.strip("| ").split(" | ") for line in written)
     rows = {name: dict(zip(header, cells, strict=False)) for name, *cells in lines}
     told = [(table["rows"][0]["cells"], fall) for table in tables for fall in table["falls"]]
     assert told
