@@ -71,6 +71,13 @@ def test_headline_numbers_are_those_of_the_benchmark() -> None:
             assert f"| {task}, `{level}` | {row['demonstrations']} | {success} | {beside} |" in results
             if level == "varied":
                 assert f"| {task}, everything varied | {row['demonstrations']} | {success} |" in readme
+    nominal = json.loads((ROOT / "docs/benchmark/headline.json").read_text())["tables"]
+    (row,) = next(table["rows"] for table in nominal if table["title"] == "Table lift")
+    (run,) = row["cells"]["table_lift"]
+    low, high = (f"{bound:.3g}" for bound in run["pc_success_ci95"])
+    success = f"{row['demonstrations']} | {run['n_success']:,} of {run['n_episodes']:,} | {low} to {high} % |"
+    assert f"| table lift | {success}" in readme
+    assert f"| table lift, the default policy (seeds 650000 and up) | {success}" in results
 
 
 EVENTS = {
