@@ -78,6 +78,13 @@ def test_headline_numbers_are_those_of_the_benchmark() -> None:
     success = f"{row['demonstrations']} | {run['n_success']:,} of {run['n_episodes']:,} | {low} to {high} % |"
     assert f"| table lift | {success}" in readme
     assert f"| table lift, the default policy (seeds 650000 and up) | {success}" in results
+    few = next(table["rows"] for table in nominal if table["title"] == "Table lift from ten demonstrations")
+    runs = [run for row in few for run in row["cells"]["table_lift, few"]]
+    success = (
+        f"10 | {len(runs)} × {runs[0]['n_episodes']}: {', '.join(f'{run["pc_success"]:.3g}' for run in runs)} % | |"
+    )
+    assert f"| table lift, three trainings | {success}" in readme
+    assert f"| table lift, the default policy, three trainings (seeds 650000 and up) | {success}" in results
 
 
 EVENTS = {
