@@ -90,8 +90,8 @@ def test_headline_numbers_are_those_of_the_benchmark() -> None:
 EVENTS = {
     "push": "the object is pushed before it is grasped",
     "push_held": "it is pushed while it is held",
-    "open_hand": "a hand opens for up to half a second",
-    "stop_motor": "a motor stops for up to a second",
+    "open_hand": "a hand opens for 0.3 to 0.6 s",
+    "stop_motor": "a motor stops for 0.5 to 1 s",
     "platform_slide": "the goal slides",
     "rack_slide": "the goal slides",
     "freeze": "the sensor freezes",
