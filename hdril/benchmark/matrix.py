@@ -201,6 +201,16 @@ def drawn(matrix: Matrix, table: TableSpec) -> dict[str, Play]:
     return {name: Play(evaluated[0], table.episode) for name, evaluated in row.evaluations.items()}
 
 
+def drawn_data(matrix: Matrix, table: TableSpec) -> dict[str, Record]:
+    """The demonstrations that are drawn, by name; of each, the smallest set that is learned from."""
+    if not table.trajectories:
+        return {}
+    ordered = sorted(rows(matrix, table), key=lambda row: -row.demonstrations)
+    return {row.data: row.trainings[0].data for row in ordered}
+
+
 def all_steps(matrix: Matrix) -> list[Step]:
-    """All that the report of a matrix is made of: the evaluations, and the episodes that are drawn."""
-    return [*steps(matrix), *(step for table in matrix.tables for step in drawn(matrix, table).values())]
+    """All that the report of a matrix is made of: the evaluations, and what is drawn."""
+    episodes = [step for table in matrix.tables for step in drawn(matrix, table).values()]
+    recorded = [step for table in matrix.tables for step in drawn_data(matrix, table).values()]
+    return [*steps(matrix), *episodes, *recorded]

@@ -35,7 +35,7 @@ def write_report(document: Path, results: Mapping[str, Any], gone: Iterable[str]
         return document.with_name(document.name + suffix)
 
     drawn = [figures(table) for table in results["tables"]]
-    files: dict[Path, bytes] = {beside(".json"): _one_table_a_line(results).encode()}
+    files: dict[Path, bytes] = {numbers_file(document): _one_a_line(results).encode()}
     names = []
     for table, found in zip(results["tables"], drawn, strict=True):
         names.append([f"{document.name}_{slug(table['title'])}_{name}" for name in found])
@@ -54,10 +54,22 @@ def write_report(document: Path, results: Mapping[str, Any], gone: Iterable[str]
     return list(files)
 
 
-def _one_table_a_line(results: Mapping[str, Any]) -> str:
-    """JSON that is small, and of which a change of one table changes one line."""
-    marked = json.dumps({**results, "tables": []})
-    return marked.replace('"tables": []', '"tables": [\n' + ",\n".join(map(json.dumps, results["tables"])) + "\n]")
+def numbers_file(document: Path) -> Path:
+    """Where the numbers of a report are."""
+    return document.with_name(document.name + ".json")
+
+
+def write_numbers(document: Path, results: Mapping[str, Any]) -> None:
+    """Write ``<document>.json`` alone: the tables are as they were."""
+    write_atomically(numbers_file(document), lambda file: file.write(_one_a_line(results).encode()))
+
+
+def _one_a_line(results: Mapping[str, Any]) -> str:
+    """JSON that is small, and of which a change of one table, or of one run of an unfinished one, changes one line."""
+    lists = {key: ",\n".join(map(json.dumps, results.get(key, []))) for key in ("tables", "runs")}
+    rest = json.dumps({key: value for key, value in results.items() if key not in lists})
+    told = "".join(f', "{key}": [\n{lines}\n]' if lines else f', "{key}": []' for key, lines in lists.items())
+    return f"{rest[:-1]}{told}}}"
 
 
 def slug(title: str) -> str:

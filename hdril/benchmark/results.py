@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import product
 from typing import Any
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from hdril.benchmark.engine import in_order
 from hdril.benchmark.episode import EPISODE, places
-from hdril.benchmark.matrix import EvaluationSpec, Matrix, Row, TableSpec, all_steps, drawn, rows
-from hdril.benchmark.steps import Evaluate
+from hdril.benchmark.matrix import EvaluationSpec, Matrix, Row, TableSpec, drawn, drawn_data, rows, steps
+from hdril.benchmark.steps import Evaluate, Play, Step, Train
 from hdril.benchmark.store import Store
 from hdril.demonstrations.read import read_episode
 from hdril.digest import SHORT, digest_file, digest_json
@@ -45,19 +45,43 @@ _LATER: dict[str, Any] = {
 """Options that came later than reports which are kept. A definition that does not use them asks for what it asked for before."""
 
 
-def collect(matrix: Matrix, store: Store) -> dict[str, Any]:
-    """The numbers of all tables, all of whose steps are done.
+Kept = Mapping[str, Mapping[str, Any]]
+"""What a report has of steps, by their recipes: evaluations and drawn episodes."""
+
+
+def collect(matrix: Matrix, store: Store, kept: Kept | None = None) -> dict[str, Any]:
+    """The numbers of all tables, each of whose steps is done or among those that are ``kept``.
 
     Raises:
-        KeyError: a step is not done.
+        KeyError: a step is neither.
         ValueError: an evaluation holds other seeds than the matrix says.
     """
+    return blank(matrix) | {"tables": [_table(matrix, table, store, kept or {}) for table in matrix.tables]}
+
+
+def blank(matrix: Matrix) -> dict[str, Any]:
+    """Results without a table."""
     return {
         "name": matrix.name,
         "tuning": matrix.tuning,
         "used_seeds": str(matrix.used_seeds or ""),
-        "tables": [_table(matrix, table, store) | {"made": _made(matrix, table, store)} for table in matrix.tables],
+        "tables": [],
+        "runs": [],
     }
+
+
+def kept_runs(report: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """What a report has of steps that need not be done again. Older reports do not say how their numbers were made."""
+    tables = report.get("tables", [])
+    found = [run for table in tables for row in table.get("rows", []) for runs in row["cells"].values() for run in runs]
+    found += [episode for table in tables for episode in table.get("episodes", {}).values()]
+    return {run["recipe"]: run for run in (*found, *report.get("runs", [])) if "recipe" in run}
+
+
+def unfinished(matrix: Matrix, store: Store, results: Mapping[str, Any], runs: Kept) -> list[Mapping[str, Any]]:
+    """Those of the ``runs`` that no table of the results has, and a table of the matrix still asks for."""
+    asked = {store.recipe(step) for step in steps(matrix)} - kept_runs(results).keys()
+    return [run for recipe, run in runs.items() if recipe in asked]
 
 
 def keep_tables(matrix: Matrix, results: dict[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
@@ -104,24 +128,24 @@ def _without_later(definition: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in definition.items() if _LATER.get(key) != value}
 
 
-def _made(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
+def _made(matrix: Matrix, table: TableSpec, store: Store, runs: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """What made a table: the versions that the evaluations used, the machines, and how many hours the steps took together."""
-    steps = all_steps(replace(matrix, tables=[table]))
-    done = [store.get(step) for step in in_order(steps)]
-    made_from = [store.made_from(step) or {} for step in steps if isinstance(step, Evaluate)]
+    told = [step for run in runs for step in (run, *run["made_from"].values())]
+    seconds = {step["recipe"]: step["seconds"] for step in told}
+    evaluated = [store.settings(step)["software"] for step in steps(replace(matrix, tables=[table]))]
     return {
         "asked": _asked(matrix, table),
-        "software": {name: version for each in made_from for name, version in each["settings"]["software"].items()},
-        "machines": sorted({each.machine for each in done}),
-        "commits": sorted({each.commit for each in done} - {""}),
-        "hours": round(sum(each.seconds for each in done) / 3600.0, 2),
+        "software": {name: version for software in evaluated for name, version in software.items()},
+        "machines": sorted({step["machine"] for step in told}),
+        "commits": sorted({step["commit"] for step in told} - {""}),
+        "hours": round(sum(seconds.values()) / 3600.0, 2),
     }
 
 
-def _table(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
-    wanted = list(rows(matrix, table))
-    found = [_row(row, store) for row in wanted]
-    recorded = {row.data: row.trainings[0].data for row in sorted(wanted, key=lambda row: row.demonstrations)}
+def _table(matrix: Matrix, table: TableSpec, store: Store, kept: Kept) -> dict[str, Any]:
+    found = [_row(row, store, kept) for row in rows(matrix, table)]
+    episodes = {name: _episode(step, store, kept) for name, step in drawn(matrix, table).items()}
+    evaluated = [run for row in found for runs in row["cells"].values() for run in runs]
     return {
         "title": table.title,
         "note": table.note,
@@ -139,13 +163,19 @@ def _table(matrix: Matrix, table: TableSpec, store: Store) -> dict[str, Any]:
         "falls": _falls(matrix, table, found),
         "trajectories": {
             name: [places(read_episode(store.get(step).output, number).state) for number in range(table.trajectories)]
-            for name, step in recorded.items()
+            for name, step in drawn_data(matrix, table).items()
         },
-        "episodes": {
-            name: read_json(store.get(step).output / EPISODE) | {"title": step.evaluation.policy.title}
-            for name, step in drawn(matrix, table).items()
-        },
+        "episodes": episodes,
+        "made": _made(matrix, table, store, [*evaluated, *episodes.values()]),
     }
+
+
+def _episode(step: Play, store: Store, kept: Kept) -> Mapping[str, Any]:
+    """A drawn episode, frame by frame."""
+    if known := kept.get(store.recipe(step)):
+        return known
+    told = {"title": step.evaluation.policy.title} | _provenance(step, store)
+    return read_json(store.get(step).output / EPISODE) | told
 
 
 def _phases(matrix: Matrix, table: TableSpec) -> dict[str, list[str]]:
@@ -153,26 +183,49 @@ def _phases(matrix: Matrix, table: TableSpec) -> dict[str, list[str]]:
     return table.phases or {name: [name] for name in get_task(matrix.data[table.data[0]].task).labels}
 
 
-def _row(row: Row, store: Store) -> dict[str, Any]:
-    trainings = [store.get(step) for step in row.trainings]
-    steps = row.trainings[0].count_steps(store.input_folders(row.trainings[0]))
+def _row(row: Row, store: Store, kept: Kept) -> dict[str, Any]:
+    cells = {
+        name: [kept.get(store.recipe(step)) or run_of(step, store) for step in steps]
+        for name, steps in row.evaluations.items()
+    }
+    made_from = [run["made_from"] for run in next(iter(cells.values()))]
+    trained = [made["train"] for made in made_from]
     return {
         "data": row.data,
         "policy": row.policy,
         "demonstrations": row.demonstrations,
         "minutes": row.minutes,
-        "steps": steps,
-        "training_minutes": [round(done.seconds / 60.0, 1) for done in trainings],
-        "record_command": store.relative(store.get(row.trainings[0].data).command),
-        "training_commands": [store.relative(done.command) for done in trainings],
-        "cells": {name: [_run(step, store) for step in steps] for name, steps in row.evaluations.items()},
+        "steps": trained[0]["steps"],
+        "training_minutes": [round(training["seconds"] / 60.0, 1) for training in trained],
+        "record_command": made_from[0]["record"]["command"],
+        "training_commands": [training["command"] for training in trained],
+        "cells": cells,
     }
 
 
-def _run(step: Evaluate, store: Store) -> dict[str, Any]:
-    """One evaluation: its numbers, what was evaluated, and the command. ``failed_seeds`` lets a reader pair two policies.
+def _provenance(step: Step, store: Store) -> dict[str, Any]:
+    """How a step was done, and in ``made_from``, by kind, how all that it is made from was."""
+    *inputs, _ = in_order([step])
+    return _how(step, store) | {"made_from": {other.kind: _how(other, store) for other in inputs}}
+
+
+def _how(step: Step, store: Store) -> dict[str, Any]:
+    done = store.get(step)
+    trained = {"steps": step.count_steps(store.input_folders(step))} if isinstance(step, Train) else {}
+    return trained | {
+        "recipe": store.recipe(step),
+        "command": store.relative(done.command),
+        "seconds": done.seconds,
+        "machine": done.machine,
+        "commit": done.commit,
+    }
+
+
+def run_of(step: Evaluate, store: Store) -> dict[str, Any]:
+    """One evaluation: its numbers, what was evaluated, and how. ``failed_seeds`` lets a reader pair two policies.
 
     Raises:
+        KeyError: it is not done.
         ValueError: it holds other seeds than were asked for, or seeds that are not known to be held out.
     """
     done = store.get(step)
@@ -186,15 +239,18 @@ def _run(step: Evaluate, store: Store) -> dict[str, Any]:
     interval = wilson_interval(results["n_success"], results["n_episodes"])
     telling = any(episode["primitives"] for episode in results["per_episode"])
     noticed = [episode["success"] for episode in results["per_episode"] if episode["noticed"]]
-    return {key: results[key] for key in _KEPT} | {
-        "pc_noticed": 100.0 * len(noticed) / results["n_episodes"] if telling else None,
-        "pc_success_noticed": 100.0 * sum(noticed) / len(noticed) if noticed else None,
-        "pc_success_ci95": [100.0 * bound for bound in interval],
-        "training_seed": step.policy.seed,
-        "weights": results["identity"]["policy"]["weights"],
-        "failed_seeds": [episode["seed"] for episode in results["per_episode"] if not episode["success"]],
-        "command": store.relative(done.command),
-    }
+    return (
+        {key: results[key] for key in _KEPT}
+        | {
+            "pc_noticed": 100.0 * len(noticed) / results["n_episodes"] if telling else None,
+            "pc_success_noticed": 100.0 * sum(noticed) / len(noticed) if noticed else None,
+            "pc_success_ci95": [100.0 * bound for bound in interval],
+            "training_seed": step.policy.seed,
+            "weights": results["identity"]["policy"]["weights"],
+            "failed_seeds": [episode["seed"] for episode in results["per_episode"] if not episode["success"]],
+        }
+        | _provenance(step, store)
+    )
 
 
 def _outcomes(runs: Sequence[Mapping[str, Any]], evaluation: EvaluationSpec) -> NDArray[np.bool_]:

@@ -46,6 +46,7 @@ class Store:
         self.folder = folder.absolute()
         self._done: dict[Step, Done] = {}
         self._settings: dict[Step, dict[str, Any]] = {}
+        self._recipes: dict[Step, str] = {}
 
     def find(self, step: Step) -> Done | None:
         """What is known of a step that is done; None if it is not."""
@@ -72,10 +73,22 @@ class Store:
     def made_from(self, step: Step) -> dict[str, Any] | None:
         """All that decides the result of a step, as JSON; None as long as an input is not done."""
         inputs = {name: self.find(other) for name, other in step.inputs.items()}
+        digests = {name: done.digest for name, done in inputs.items() if done is not None}
+        return {"settings": self.settings(step), "inputs": digests} if len(digests) == len(inputs) else None
+
+    def settings(self, step: Step) -> dict[str, Any]:
+        """:meth:`Step.settings`, worked out once."""
         if step not in self._settings:
             self._settings[step] = step.settings()
-        digests = {name: done.digest for name, done in inputs.items() if done is not None}
-        return {"settings": self._settings[step], "inputs": digests} if len(digests) == len(inputs) else None
+        return self._settings[step]
+
+    def recipe(self, step: Step) -> str:
+        """Digest of how a step is made: its settings, and the recipes of its inputs. Known before anything is done, and the same
+        on every machine, while the digests of results are not."""
+        if step not in self._recipes:
+            inputs = {name: self.recipe(other) for name, other in step.inputs.items()}
+            self._recipes[step] = digest_json([step.kind, self.settings(step), inputs])[: 2 * SHORT]
+        return self._recipes[step]
 
     def input_folders(self, step: Step) -> dict[str, Path]:
         """Where the results of a step's inputs are.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
@@ -16,10 +16,10 @@ from tqdm import tqdm
 from hdril.benchmark.check import check
 from hdril.benchmark.engine import Engine, Progress, in_order
 from hdril.benchmark.matrix import Matrix, all_steps
-from hdril.benchmark.page import write_report
+from hdril.benchmark.page import numbers_file, write_numbers, write_report
 from hdril.benchmark.perform import is_running
-from hdril.benchmark.results import collect, keep_tables
-from hdril.benchmark.steps import Step
+from hdril.benchmark.results import Kept, blank, collect, keep_tables, kept_runs, run_of, unfinished
+from hdril.benchmark.steps import Evaluate, Step
 from hdril.benchmark.store import Store
 from hdril.cli.common import run
 from hdril.cli.shards import log_folder
@@ -33,13 +33,15 @@ class BenchmarkConfig(Matrix):
     """Record, train and evaluate what a matrix names, and report it with statistics.
 
     Results are kept by what they are made from. After Ctrl-C or a kill, the same command goes on, and a step whose options,
-    inputs or software changed is done anew. Several of these commands may run at once.
+    inputs or software changed is done anew. Several of these commands may run at once. An evaluation that the report has is not
+    done again, even if the store is lost.
     """
 
     store: Path = Path("outputs/benchmark/store")
     """Folder of all results."""
     document: Path | None = None
-    """Where the report goes, without suffix: .html, .md, .json and figures. Default: outputs/benchmark/<name>/<name>."""
+    """Where the report goes, without suffix: .html, .md, .json and figures. Default: outputs/benchmark/<name>/<name>. Give a new
+    one to do again what an old one has."""
     only: list[str] = field(default_factory=list)
     """Titles of tables to do, ["Table lift"]; all unless given. The others stay in the report as it has them, if their definition
     has not changed."""
@@ -79,28 +81,30 @@ def benchmark_command(config: BenchmarkConfig) -> None:
         raise ValueError("--shards and --slurm.* are for --executor=slurm; --jobs is for this machine")
     if not config.plan:
         check_execution(config.executor, config.shards, config.slurm)
-    _report_before(config)  # what is wrong with it is told before anything is done
-    store, wanted = Store(config.store), all_steps(config.chosen)
+    store, kept = Store(config.store), kept_runs(_report_before(config))
     if config.plan:
-        _print_plan(store, wanted, config.jobs)
+        _print_plan(config, store, kept)
         return
     if config.executor == "slurm":
         _submit(config)
         return
+    wanted = _left(config, store, kept)
     with tqdm(total=len(in_order(wanted)), desc=config.name, unit="step") as bar:
 
         def watch(step: Step, progress: Progress) -> None:
             seconds = progress.remaining()
             if progress.fresh:
                 bar.write(f"{store.get(step).seconds:6.0f} s  {step.title}")
+                _keep(config, store, step)
             bar.set_postfix_str("" if seconds is None else f"about {_in_words(seconds)} left")
             bar.update()
 
         Engine(store, config.jobs, watch).run(wanted)
-    results, document = collect(config.chosen, store), _document(config)
+    results, document = collect(config.chosen, store, kept), _document(config)
     with FileLock(config.store / LOCK):  # another command may write other tables of the same report
         before = _report_before(config)
         results = keep_tables(config, results, before)
+        results["runs"] = unfinished(config, store, results, kept_runs(before))
         titles = {table["title"] for table in results["tables"]}
         gone = [table["title"] for table in before.get("tables", []) if table["title"] not in titles]
         write_report(document, results, gone)
@@ -109,14 +113,28 @@ def benchmark_command(config: BenchmarkConfig) -> None:
     print(f"Report: {document}.html, and as Markdown beside it")
 
 
+def _left(config: BenchmarkConfig, store: Store, kept: Kept) -> list[Step]:
+    """What the tables that are to be done are made of, without what the report has."""
+    return [step for step in all_steps(config.chosen) if store.recipe(step) not in kept]
+
+
+def _keep(config: BenchmarkConfig, store: Store, step: Step) -> None:
+    """Let the report have an evaluation as soon as it is done. A table may take days, and a store may be lost meanwhile."""
+    if isinstance(step, Evaluate):
+        with FileLock(config.store / LOCK):
+            before = _report_before(config) or blank(config)
+            runs = {run["recipe"]: run for run in (*before.get("runs", []), run_of(step, store))}
+            write_numbers(_document(config), {**before, "runs": list(runs.values())})
+
+
 def _report_before(config: BenchmarkConfig) -> Mapping[str, Any]:
-    """The report that some tables are to be added to; empty if there is none, or all tables are to be done.
+    """The report that is there, to which tables are to be added; empty if there is none.
 
     Raises:
         ValueError: it is damaged, or of another benchmark.
     """
-    path = _document(config).with_name(_document(config).name + ".json")
-    if not (config.only and path.exists()):
+    path = numbers_file(_document(config))
+    if not path.exists():
         return {}
     found = read_json(path)
     ours = {"name": config.name, "tuning": config.tuning}
@@ -144,18 +162,24 @@ def _submit(config: BenchmarkConfig) -> None:
 
 
 def _do_steps(config: BenchmarkConfig, rank: int, world_size: int) -> None:
-    Engine(Store(config.store), config.jobs).run(all_steps(config.chosen))
+    store = Store(config.store)
+    Engine(store, config.jobs).run(_left(config, store, kept_runs(_report_before(config))))
 
 
 def _in_words(seconds: float) -> str:
     return f"{max(seconds / 60.0, 1.0):.0f} min" if seconds < 7200 else f"{seconds / 3600.0:.1f} h"
 
 
-def _print_plan(store: Store, wanted: Sequence[Step], jobs: int) -> None:
-    """Each step: done, and in what time; running, in this command or another; or left. And how long what is left may take."""
-    ordered = in_order(wanted)
-    progress = Progress.of(ordered, jobs)
-    count = 0
+def _print_plan(config: BenchmarkConfig, store: Store, kept: Kept) -> None:
+    """Each step: kept, in the report; done, and in what time; running, in this command or another; or left. And how long what is
+    left may take."""
+    left = _left(config, store, kept)
+    known = [step for step in in_order(all_steps(config.chosen)) if store.recipe(step) in kept]
+    for step in known:
+        print(f"kept    {step.kind:9} {step.title}")
+    ordered = in_order(left)
+    progress = Progress.of(ordered, config.jobs)
+    count = len(known)
     for step in ordered:
         if done := store.find(step):
             count += 1
@@ -167,7 +191,7 @@ def _print_plan(store: Store, wanted: Sequence[Step], jobs: int) -> None:
         print(f"{'running' if running else 'left':7} {step.kind:9} {step.title}")
     seconds = progress.remaining()
     rest = f"; about {_in_words(seconds)} are left" if seconds else ""
-    print(f"{count} of {len(ordered)} steps are done{rest}")
+    print(f"{count} of {len(known) + len(ordered)} steps are done{rest}")
 
 
 def main() -> None:

@@ -7,7 +7,8 @@ import json
 import re
 import shutil
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import dataclass, field, fields, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from hdril.benchmark.engine import in_order
 from hdril.benchmark.figures import figures
 from hdril.benchmark.matrix import Matrix, all_steps, rows, steps
 from hdril.benchmark.page import write_report
+from hdril.benchmark.perform import Assignment
 from hdril.benchmark.report import markdown
 from hdril.benchmark.results import collect
 from hdril.benchmark.steps import Calibrate, Evaluate, Play, Record, Step
@@ -31,6 +33,7 @@ from hdril.benchmark.store import Store
 from hdril.cli.benchmark import BenchmarkConfig, benchmark_command
 from hdril.demonstrations.read import read_episode
 from hdril.digest import digest_json
+from hdril.errors import UserError
 from hdril.evaluation.results import Run, summarise
 from hdril.execution import SlurmConfig
 from hdril.files import exclusively
@@ -454,21 +457,25 @@ def pretend(store: Store, matrix: Matrix, failed: Callable[[Evaluate], set[int]]
     for step in in_order(all_steps(matrix)):
         place = store.place(step)
         assert place is not None
-        (place / "result").mkdir(parents=True)
-        command = " ".join(step.command(place / "result", store.input_folders(step)))
-        done = {"digest": digest_json(step.title), "seconds": 90.0, "command": command, "machine": "a machine"}
-        (place / "step.json").write_text(json.dumps(done))
-        if isinstance(step, Evaluate):
-            seeds = range(step.first_seed, step.first_seed + step.episodes)
-            moved = {"motion": {"jerk_m_s3": 2.5}, "expert_jerk_m_s3": 2.0}
-            outcomes = [outcome(seed, success=seed not in failed(step), **moved) for seed in seeds]
-            run = Run(step.task, "policy", (), step.first_seed, step.episodes, True, "compared")
-            results = summarise(run, outcomes) | {"identity": {"policy": {"weights": digest_json(step.policy.title)}}}
-            (place / "result/results.json").write_text(json.dumps(results))
-        if isinstance(step, Play):
-            (place / "result/episode.json").write_text(json.dumps(EPISODE))
-        if isinstance(step, Calibrate):
-            (place / "result/speed.json").write_text(json.dumps(vars(SPEEDS[step.training.name])))
+        pretend_step(step, place, step.command(place / "result", store.input_folders(step)), failed)
+
+
+def pretend_step(step: Step, place: Path, command: list[str], failed: Callable[[Evaluate], set[int]]) -> None:
+    """Fill a place as if its step had been done."""
+    (place / "result").mkdir(parents=True)
+    done = {"digest": digest_json(step.title), "seconds": 90.0, "command": " ".join(command), "machine": "a machine"}
+    (place / "step.json").write_text(json.dumps(done))
+    if isinstance(step, Evaluate):
+        seeds = range(step.first_seed, step.first_seed + step.episodes)
+        moved = {"motion": {"jerk_m_s3": 2.5}, "expert_jerk_m_s3": 2.0}
+        outcomes = [outcome(seed, success=seed not in failed(step), **moved) for seed in seeds]
+        run = Run(step.task, "policy", (), step.first_seed, step.episodes, True, "compared")
+        results = summarise(run, outcomes) | {"identity": {"policy": {"weights": digest_json(step.policy.title)}}}
+        (place / "result/results.json").write_text(json.dumps(results))
+    if isinstance(step, Play):
+        (place / "result/episode.json").write_text(json.dumps(EPISODE))
+    if isinstance(step, Calibrate):
+        (place / "result/speed.json").write_text(json.dumps(vars(SPEEDS[step.training.name])))
 
 
 EPISODE = {
@@ -1450,6 +1457,113 @@ def test_a_report_grows_table_by_table(tmp_path: Path) -> None:
     assert (kept["note"], kept["published"], kept["published_by"]) == ("A better note.", {"act": "9 %"}, "others")
     with pytest.raises(ValueError, match=r"^only has no table 'Peg'; choose from: 'Lift', 'Again, nominal'$"):
         do(tmp_path, "Peg", "two")
+
+
+class Doer:
+    """Does steps in no time. An evaluation of a policy that is in ``broken`` fails."""
+
+    def __init__(self, broken: str = "") -> None:
+        self.broken = broken
+        self.begun: list[Step] = []
+
+    def start(self, assignment: Assignment) -> Doing:
+        """In place of :func:`hdril.benchmark.perform.start`."""
+        step = assignment.step
+        if isinstance(step, Evaluate) and step.policy.name == self.broken:
+            return Doing(1)
+        self.begun.append(step)
+        command = step.command(assignment.place / "result", assignment.inputs)
+        pretend_step(step, assignment.place, command, fails)
+        return Doing(0)
+
+    def kinds(self, kind: str) -> set[str]:
+        """Policies of the steps of a kind that were begun."""
+        steps = [step for step in self.begun if step.kind == kind]
+        return {step.policy.name if isinstance(step, Evaluate) else step.title.split()[0] for step in steps}
+
+
+@dataclass
+class Doing:
+    """A process that is over."""
+
+    returncode: int
+    stdin: Any = field(default_factory=BytesIO)
+
+    def poll(self) -> int:
+        return self.returncode
+
+    def communicate(self) -> tuple[None, bytes]:
+        return None, b""
+
+    def wait(self) -> int:
+        return self.returncode
+
+
+def test_an_evaluation_that_the_report_has_is_not_done_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A session ends before its table is whole, and the store is lost; the next one, elsewhere, does what is missing."""
+    matrix = changed(lambda values: (one_row(values), values["tables"][0].update(episode=SEED)))
+
+    def run(document: str, doer: Doer) -> dict[str, Any]:
+        monkeypatch.setattr("hdril.benchmark.engine.start", doer.start)
+        config = BenchmarkConfig(**vars(matrix), store=tmp_path / f"store of {document}", document=tmp_path / document)
+        try:
+            benchmark_command(config)
+        finally:
+            shutil.rmtree(config.store)
+        return json.loads((tmp_path / f"{document}.json").read_text())
+
+    with pytest.raises(UserError, match="a step failed: hdril on 50 of"):
+        run("parts", Doer(broken="hdril"))
+    assert {path.name for path in tmp_path.iterdir()} == {"parts.json"}, "no table is whole"
+    unfinished = json.loads((tmp_path / "parts.json").read_text())
+    assert unfinished["tables"] == []
+    assert [run["n_success"] for run in unfinished["runs"]] == [0, COUNT - 2, COUNT - 1, COUNT - 1]
+
+    rest = Doer()
+    parts = run("parts", rest)
+    assert (rest.kinds("train"), rest.kinds("evaluate")) == ({"hdril"}, {"hdril"}), "the others are in the report"
+    assert parts == run("whole", Doer())
+    assert parts["runs"] == [], "the table has them"
+
+    monkeypatch.setattr("hdril.benchmark.engine.start", None)  # doing a step would fail
+    config = BenchmarkConfig(**vars(matrix), store=tmp_path / "none", document=tmp_path / "parts")
+    benchmark_command(config)
+    assert json.loads((tmp_path / "parts.json").read_text()) == parts
+    capsys.readouterr()
+    benchmark_command(replace(config, plan=True))
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert last == "7 of 7 steps are done"
+    assert {line.split()[0] for line in lines} == {"kept"}
+
+    again = Doer()
+    with monkeypatch.context() as edited:
+        edited.setattr("hdril.benchmark.steps.package_software", lambda package: {package: "another source"})
+        run("parts", again)
+    assert (again.kinds("train"), again.kinds("evaluate")) == ({"linear", "hdril"}, {"linear", "hdril"}), "not ACT's"
+
+
+def test_runs_that_no_table_asks_for_leave_the_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(title: str, doer: Doer, change: Callable[[dict[str, Any]], object]) -> None:
+        monkeypatch.setattr("hdril.benchmark.engine.start", doer.start)
+        document, store = tmp_path / "report", tmp_path / "store"
+        benchmark_command(BenchmarkConfig(**vars(changed(change)), store=store, document=document, only=[title]))
+
+    def kept() -> list[str]:
+        return [run["command"] for run in json.loads((tmp_path / "report.json").read_text())["runs"]]
+
+    def without_act(values: dict[str, Any]) -> None:
+        two_tables(values)
+        values["tables"][0].update(policies=["linear", "hdril"])
+
+    with pytest.raises(UserError):
+        run("Lift", Doer(broken="hdril"), two_tables)
+    assert len(kept()) == 4
+    run("Again, nominal", Doer(), two_tables)
+    assert len(kept()) == 4, "what another table is made of stays"
+    run("Again, nominal", Doer(), without_act)
+    assert len(kept()) == 2
 
 
 @pytest.mark.usefixtures("nothing_is_done")
