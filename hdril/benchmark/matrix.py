@@ -202,10 +202,10 @@ def drawn(matrix: Matrix, table: TableSpec) -> dict[str, Play]:
 
 
 def drawn_data(matrix: Matrix, table: TableSpec) -> dict[str, Record]:
-    """The demonstrations that are drawn, by name; of each, the smallest set that is learned from."""
+    """The demonstrations that are drawn, by name; of each, the largest set that is learned from."""
     if not table.trajectories:
         return {}
-    ordered = sorted(rows(matrix, table), key=lambda row: -row.demonstrations)
+    ordered = sorted(rows(matrix, table), key=lambda row: row.demonstrations)
     return {row.data: row.trainings[0].data for row in ordered}
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hdril.benchmark.engine import in_order
 from hdril.benchmark.episode import EPISODE, places
-from hdril.benchmark.matrix import EvaluationSpec, Matrix, Row, TableSpec, drawn, drawn_data, rows, steps
+from hdril.benchmark.matrix import EvaluationSpec, Matrix, Row, TableSpec, all_steps, drawn, drawn_data, rows, steps
 from hdril.benchmark.steps import Evaluate, Play, Step, Train
 from hdril.benchmark.store import Store
 from hdril.demonstrations.read import read_episode
@@ -28,7 +28,7 @@ from hdril.evaluation.statistics import (
 from hdril.evaluation.stored import read_evaluation
 from hdril.tasks import get_task
 
-_KEPT = ("n_episodes", "n_success", "pc_success", "held_out", "position_error_cm", "angle_error_rad", "dtw_cm",
+_NUMBERS = ("n_episodes", "n_success", "pc_success", "held_out", "position_error_cm", "angle_error_rad", "dtw_cm",
           "position_error_cm_by_primitive", "pc_expert_choice", "jerk_to_expert", "n_expert_failures",
           "stages_reached")  # fmt: skip
 
@@ -47,10 +47,12 @@ _LATER: dict[str, Any] = {
 
 Kept = Mapping[str, Mapping[str, Any]]
 """What a report has of steps, by their recipes: evaluations and drawn episodes."""
+_RUN_SHAPE = 1
+"""Of these as data. It counts up when one of them is told in another way: reports of before are read from the store again."""
 
 
 def collect(matrix: Matrix, store: Store, kept: Kept | None = None) -> dict[str, Any]:
-    """The numbers of all tables, each of whose steps is done or among those that are ``kept``.
+    """The numbers of all tables, each of whose steps is done or taken from those that are ``kept``.
 
     Raises:
         KeyError: a step is neither.
@@ -75,12 +77,32 @@ def kept_runs(report: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     tables = report.get("tables", [])
     found = [run for table in tables for row in table.get("rows", []) for runs in row["cells"].values() for run in runs]
     found += [episode for table in tables for episode in table.get("episodes", {}).values()]
-    return {run["recipe"]: run for run in (*found, *report.get("runs", [])) if "recipe" in run}
+    return {run["recipe"]: run for run in (*report.get("runs", []), *found) if run.get("shape") == _RUN_SHAPE}
+
+
+def usable(matrix: Matrix, table: TableSpec, store: Store, kept: Kept) -> dict[str, Mapping[str, Any]]:
+    """What a table takes from a report: all that it asks of a training, or nothing, so that a row is of one trained policy.
+
+    The same training on another machine gives other weights.
+    """
+    asked: dict[Train, list[str]] = {}
+    for row in rows(matrix, table):
+        for step in (step for evaluated in row.evaluations.values() for step in evaluated):
+            asked.setdefault(step.policy, []).append(store.recipe(step))
+    for step in drawn(matrix, table).values():
+        asked[step.evaluation.policy].append(store.recipe(step))
+    whole = [recipes for recipes in asked.values() if len({_trained(kept.get(recipe)) for recipe in recipes}) == 1]
+    return {recipe: kept[recipe] for recipes in whole for recipe in recipes if recipe in kept}
+
+
+def _trained(run: Mapping[str, Any] | None) -> str:
+    """Digest of the policy of a run; empty if there is none."""
+    return str(run["made_from"]["train"]["digest"]) if run else ""
 
 
 def unfinished(matrix: Matrix, store: Store, results: Mapping[str, Any], runs: Kept) -> list[Mapping[str, Any]]:
     """Those of the ``runs`` that no table of the results has, and a table of the matrix still asks for."""
-    asked = {store.recipe(step) for step in steps(matrix)} - kept_runs(results).keys()
+    asked = {store.recipe(step) for step in all_steps(matrix)} - kept_runs(results).keys()
     return [run for recipe, run in runs.items() if recipe in asked]
 
 
@@ -142,9 +164,13 @@ def _made(matrix: Matrix, table: TableSpec, store: Store, runs: Iterable[Mapping
     }
 
 
-def _table(matrix: Matrix, table: TableSpec, store: Store, kept: Kept) -> dict[str, Any]:
+def _table(matrix: Matrix, table: TableSpec, store: Store, report: Kept) -> dict[str, Any]:
+    kept = usable(matrix, table, store, report)
     found = [_row(row, store, kept) for row in rows(matrix, table)]
-    episodes = {name: _episode(step, store, kept) for name, step in drawn(matrix, table).items()}
+    episodes = {
+        name: {**(kept.get(store.recipe(step)) or run_of(step, store)), "title": step.evaluation.policy.title}
+        for name, step in drawn(matrix, table).items()
+    }
     evaluated = [run for row in found for runs in row["cells"].values() for run in runs]
     return {
         "title": table.title,
@@ -168,14 +194,6 @@ def _table(matrix: Matrix, table: TableSpec, store: Store, kept: Kept) -> dict[s
         "episodes": episodes,
         "made": _made(matrix, table, store, [*evaluated, *episodes.values()]),
     }
-
-
-def _episode(step: Play, store: Store, kept: Kept) -> Mapping[str, Any]:
-    """A drawn episode, frame by frame."""
-    if known := kept.get(store.recipe(step)):
-        return known
-    told = {"title": step.evaluation.policy.title} | _provenance(step, store)
-    return read_json(store.get(step).output / EPISODE) | told
 
 
 def _phases(matrix: Matrix, table: TableSpec) -> dict[str, list[str]]:
@@ -206,7 +224,8 @@ def _row(row: Row, store: Store, kept: Kept) -> dict[str, Any]:
 def _provenance(step: Step, store: Store) -> dict[str, Any]:
     """How a step was done, and in ``made_from``, by kind, how all that it is made from was."""
     *inputs, _ = in_order([step])
-    return _how(step, store) | {"made_from": {other.kind: _how(other, store) for other in inputs}}
+    made_from = {other.kind: _how(other, store) for other in inputs}
+    return _how(step, store) | {"shape": _RUN_SHAPE, "made_from": made_from}
 
 
 def _how(step: Step, store: Store) -> dict[str, Any]:
@@ -214,6 +233,7 @@ def _how(step: Step, store: Store) -> dict[str, Any]:
     trained = {"steps": step.count_steps(store.input_folders(step))} if isinstance(step, Train) else {}
     return trained | {
         "recipe": store.recipe(step),
+        "digest": done.digest[:SHORT],
         "command": store.relative(done.command),
         "seconds": done.seconds,
         "machine": done.machine,
@@ -221,13 +241,19 @@ def _how(step: Step, store: Store) -> dict[str, Any]:
     }
 
 
-def run_of(step: Evaluate, store: Store) -> dict[str, Any]:
-    """One evaluation: its numbers, what was evaluated, and how. ``failed_seeds`` lets a reader pair two policies.
+def run_of(step: Evaluate | Play, store: Store) -> dict[str, Any]:
+    """What an evaluation found, or an episode frame by frame, and how it was made.
 
     Raises:
         KeyError: it is not done.
         ValueError: it holds other seeds than were asked for, or seeds that are not known to be held out.
     """
+    found = _found(step, store) if isinstance(step, Evaluate) else read_json(store.get(step).output / EPISODE)
+    return found | _provenance(step, store)
+
+
+def _found(step: Evaluate, store: Store) -> dict[str, Any]:
+    """The numbers of an evaluation. ``failed_seeds`` lets a reader pair two policies."""
     done = store.get(step)
     results = read_evaluation(done.output).results
     if [episode["seed"] for episode in results["per_episode"]] != list(step.seeds):
@@ -239,18 +265,14 @@ def run_of(step: Evaluate, store: Store) -> dict[str, Any]:
     interval = wilson_interval(results["n_success"], results["n_episodes"])
     telling = any(episode["primitives"] for episode in results["per_episode"])
     noticed = [episode["success"] for episode in results["per_episode"] if episode["noticed"]]
-    return (
-        {key: results[key] for key in _KEPT}
-        | {
-            "pc_noticed": 100.0 * len(noticed) / results["n_episodes"] if telling else None,
-            "pc_success_noticed": 100.0 * sum(noticed) / len(noticed) if noticed else None,
-            "pc_success_ci95": [100.0 * bound for bound in interval],
-            "training_seed": step.policy.seed,
-            "weights": results["identity"]["policy"]["weights"],
-            "failed_seeds": [episode["seed"] for episode in results["per_episode"] if not episode["success"]],
-        }
-        | _provenance(step, store)
-    )
+    return {key: results[key] for key in _NUMBERS} | {
+        "pc_noticed": 100.0 * len(noticed) / results["n_episodes"] if telling else None,
+        "pc_success_noticed": 100.0 * sum(noticed) / len(noticed) if noticed else None,
+        "pc_success_ci95": [100.0 * bound for bound in interval],
+        "training_seed": step.policy.seed,
+        "weights": results["identity"]["policy"]["weights"],
+        "failed_seeds": [episode["seed"] for episode in results["per_episode"] if not episode["success"]],
+    }
 
 
 def _outcomes(runs: Sequence[Mapping[str, Any]], evaluation: EvaluationSpec) -> NDArray[np.bool_]:

@@ -18,8 +18,8 @@ from hdril.benchmark.engine import Engine, Progress, in_order
 from hdril.benchmark.matrix import Matrix, all_steps
 from hdril.benchmark.page import numbers_file, write_numbers, write_report
 from hdril.benchmark.perform import is_running
-from hdril.benchmark.results import Kept, blank, collect, keep_tables, kept_runs, run_of, unfinished
-from hdril.benchmark.steps import Evaluate, Step
+from hdril.benchmark.results import Kept, blank, collect, keep_tables, kept_runs, run_of, unfinished, usable
+from hdril.benchmark.steps import Evaluate, Play, Step
 from hdril.benchmark.store import Store
 from hdril.cli.common import run
 from hdril.cli.shards import log_folder
@@ -95,13 +95,13 @@ def benchmark_command(config: BenchmarkConfig) -> None:
             seconds = progress.remaining()
             if progress.fresh:
                 bar.write(f"{store.get(step).seconds:6.0f} s  {step.title}")
-                _keep(config, store, step)
+            _keep(config, store, step)
             bar.set_postfix_str("" if seconds is None else f"about {_in_words(seconds)} left")
             bar.update()
 
         Engine(store, config.jobs, watch).run(wanted)
     results, document = collect(config.chosen, store, kept), _document(config)
-    with FileLock(config.store / LOCK):  # another command may write other tables of the same report
+    with _alone(config):
         before = _report_before(config)
         results = keep_tables(config, results, before)
         results["runs"] = unfinished(config, store, results, kept_runs(before))
@@ -110,21 +110,35 @@ def benchmark_command(config: BenchmarkConfig) -> None:
         write_report(document, results, gone)
     if gone:
         print(f"No longer in the report, because they are asked for in another way now: {', '.join(gone)}")
+    if stale := len(kept_runs(before).keys() - kept_runs(results).keys()):
+        print(f"{stale} evaluations left the report, because no table asks for them with these options and versions")
     print(f"Report: {document}.html, and as Markdown beside it")
 
 
 def _left(config: BenchmarkConfig, store: Store, kept: Kept) -> list[Step]:
     """What the tables that are to be done are made of, without what the report has."""
-    return [step for step in all_steps(config.chosen) if store.recipe(step) not in kept]
+    left: dict[Step, None] = {}
+    for table in config.chosen.tables:
+        had = usable(config, table, store, kept)
+        asked = all_steps(replace(config.chosen, tables=[table]))
+        left |= dict.fromkeys(step for step in asked if store.recipe(step) not in had)
+    return list(left)
 
 
 def _keep(config: BenchmarkConfig, store: Store, step: Step) -> None:
-    """Let the report have an evaluation as soon as it is done. A table may take days, and a store may be lost meanwhile."""
-    if isinstance(step, Evaluate):
-        with FileLock(config.store / LOCK):
-            before = _report_before(config) or blank(config)
-            runs = {run["recipe"]: run for run in (*before.get("runs", []), run_of(step, store))}
-            write_numbers(_document(config), {**before, "runs": list(runs.values())})
+    """Let the report have a run as soon as it is done. A table may take days, and a store may be lost meanwhile."""
+    if isinstance(step, Evaluate | Play):
+        with _alone(config):
+            before, run = _report_before(config) or blank(config), run_of(step, store)
+            if kept_runs(before).get(run["recipe"]) != run:
+                runs = {each["recipe"]: each for each in (*before.get("runs", []), run)}
+                write_numbers(_document(config), {**before, "runs": list(runs.values())})
+
+
+def _alone(config: BenchmarkConfig) -> FileLock:
+    """Another command may write other parts of the same report."""
+    document = _document(config)
+    return FileLock(document.with_name(f".{document.name}.{LOCK}"))
 
 
 def _report_before(config: BenchmarkConfig) -> Mapping[str, Any]:
@@ -163,7 +177,8 @@ def _submit(config: BenchmarkConfig) -> None:
 
 def _do_steps(config: BenchmarkConfig, rank: int, world_size: int) -> None:
     store = Store(config.store)
-    Engine(store, config.jobs).run(_left(config, store, kept_runs(_report_before(config))))
+    engine = Engine(store, config.jobs, lambda step, progress: _keep(config, store, step))
+    engine.run(_left(config, store, kept_runs(_report_before(config))))
 
 
 def _in_words(seconds: float) -> str:
@@ -173,12 +188,14 @@ def _in_words(seconds: float) -> str:
 def _print_plan(config: BenchmarkConfig, store: Store, kept: Kept) -> None:
     """Each step: kept, in the report; done, and in what time; running, in this command or another; or left. And how long what is
     left may take."""
-    left = _left(config, store, kept)
-    known = [step for step in in_order(all_steps(config.chosen)) if store.recipe(step) in kept]
+    ordered = in_order(_left(config, store, kept))
+    rest = set(ordered)
+    known = [step for step in in_order(all_steps(config.chosen)) if step not in rest]
+    told = {step["recipe"]: step for run in kept.values() for step in (run, *run["made_from"].values())}
+    progress = Progress.of([*known, *ordered], config.jobs)
     for step in known:
         print(f"kept    {step.kind:9} {step.title}")
-    ordered = in_order(left)
-    progress = Progress.of(ordered, config.jobs)
+        progress.settle(step, told[store.recipe(step)]["seconds"])
     count = len(known)
     for step in ordered:
         if done := store.find(step):

@@ -23,7 +23,7 @@ from hdril.benchmark.calibrate import Speed
 from hdril.benchmark.check import check, check_held_out
 from hdril.benchmark.engine import in_order
 from hdril.benchmark.figures import figures
-from hdril.benchmark.matrix import Matrix, all_steps, rows, steps
+from hdril.benchmark.matrix import Matrix, all_steps, drawn_data, rows, steps
 from hdril.benchmark.page import write_report
 from hdril.benchmark.perform import Assignment
 from hdril.benchmark.report import markdown
@@ -460,10 +460,17 @@ def pretend(store: Store, matrix: Matrix, failed: Callable[[Evaluate], set[int]]
         pretend_step(step, place, step.command(place / "result", store.input_folders(step)), failed)
 
 
-def pretend_step(step: Step, place: Path, command: list[str], failed: Callable[[Evaluate], set[int]]) -> None:
-    """Fill a place as if its step had been done."""
+def pretend_step(
+    step: Step, place: Path, command: list[str], failed: Callable[[Evaluate], set[int]], machine: str = ""
+) -> None:
+    """Fill a place as if its step had been done. A machine decides digests of results."""
     (place / "result").mkdir(parents=True)
-    done = {"digest": digest_json(step.title), "seconds": 90.0, "command": " ".join(command), "machine": "a machine"}
+    done = {
+        "digest": digest_json([step.title, machine]),
+        "seconds": 90.0,
+        "command": " ".join(command),
+        "machine": "a machine",
+    }
     (place / "step.json").write_text(json.dumps(done))
     if isinstance(step, Evaluate):
         seeds = range(step.first_seed, step.first_seed + step.episodes)
@@ -1278,6 +1285,11 @@ def test_demonstrations_are_drawn_and_one_of_them_is_highlighted(dataset: Path, 
     assert [i for i, width in enumerate(widths) if width == max(widths)] == [2, 3], "both hands of the second episode"
     plain = changed(one_row)
     assert "trajectories" not in figures(collect(plain, store)["tables"][0])
+    several = changed(lambda values: values["tables"][0].update(trajectories=3, demonstrations=[2, 5]))
+    assert {step.episodes for step in drawn_data(several, several.tables[0]).values()} == {5}, (
+        "there are enough of them"
+    )
+    assert set(drawn_data(several, several.tables[0]).values()) <= set(all_steps(several))
 
 
 def test_a_held_out_episode_of_the_policy_that_matters_is_drawn(tmp_path: Path) -> None:
@@ -1460,26 +1472,27 @@ def test_a_report_grows_table_by_table(tmp_path: Path) -> None:
 
 
 class Doer:
-    """Does steps in no time. An evaluation of a policy that is in ``broken`` fails."""
+    """Does steps in no time, on a machine of its own, where trainings end in other weights. Evaluations that are ``broken``
+    fail."""
 
-    def __init__(self, broken: str = "") -> None:
-        self.broken = broken
+    def __init__(self, machine: str = "here", broken: Callable[[Evaluate], bool] = lambda step: False) -> None:
+        self.machine, self.broken = machine, broken
         self.begun: list[Step] = []
 
     def start(self, assignment: Assignment) -> Doing:
         """In place of :func:`hdril.benchmark.perform.start`."""
         step = assignment.step
-        if isinstance(step, Evaluate) and step.policy.name == self.broken:
+        if isinstance(step, Evaluate) and self.broken(step):
             return Doing(1)
         self.begun.append(step)
         command = step.command(assignment.place / "result", assignment.inputs)
-        pretend_step(step, assignment.place, command, fails)
+        pretend_step(step, assignment.place, command, fails, self.machine)
         return Doing(0)
 
-    def kinds(self, kind: str) -> set[str]:
+    def policies(self, kind: str) -> list[str]:
         """Policies of the steps of a kind that were begun."""
-        steps = [step for step in self.begun if step.kind == kind]
-        return {step.policy.name if isinstance(step, Evaluate) else step.title.split()[0] for step in steps}
+        return [step.policy.name if isinstance(step, Evaluate) else step.title.split()[0]
+                for step in self.begun if step.kind == kind]  # fmt: skip
 
 
 @dataclass
@@ -1499,71 +1512,96 @@ class Doing:
         return self.returncode
 
 
-def test_an_evaluation_that_the_report_has_is_not_done_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A session ends before its table is whole, and the store is lost; the next one, elsewhere, does what is missing."""
-    matrix = changed(lambda values: (one_row(values), values["tables"][0].update(episode=SEED)))
+@pytest.fixture
+def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, Any]]:
+    """A command for a report, after which its store is lost. Returns the report."""
 
-    def run(document: str, doer: Doer) -> dict[str, Any]:
+    def run(matrix: Matrix, document: str, doer: Doer, **options: Any) -> dict[str, Any]:
         monkeypatch.setattr("hdril.benchmark.engine.start", doer.start)
-        config = BenchmarkConfig(**vars(matrix), store=tmp_path / f"store of {document}", document=tmp_path / document)
+        config = BenchmarkConfig(**vars(matrix), store=tmp_path / "store", document=tmp_path / document, **options)
         try:
             benchmark_command(config)
+        except UserError as error:
+            assert "a step failed" in str(error)  # noqa: PT017
         finally:
-            shutil.rmtree(config.store)
+            shutil.rmtree(config.store, ignore_errors=True)
         return json.loads((tmp_path / f"{document}.json").read_text())
 
-    with pytest.raises(UserError, match="a step failed: hdril on 50 of"):
-        run("parts", Doer(broken="hdril"))
-    assert {path.name for path in tmp_path.iterdir()} == {"parts.json"}, "no table is whole"
-    unfinished = json.loads((tmp_path / "parts.json").read_text())
-    assert unfinished["tables"] == []
-    assert [run["n_success"] for run in unfinished["runs"]] == [0, COUNT - 2, COUNT - 1, COUNT - 1]
+    return run
+
+
+def test_an_evaluation_that_the_report_has_is_not_done_again(
+    tmp_path: Path,
+    session: Callable[..., dict[str, Any]],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A machine is gone before a table is whole; the next one does what is missing."""
+    matrix = changed(lambda values: (one_row(values), values["tables"][0].update(episode=SEED)))
+    begun = session(matrix, "parts", Doer(broken=lambda step: step.policy.name == "act"))
+    assert begun["tables"] == []
+    assert [run.get("n_success") for run in begun["runs"]] == [0, COUNT - 2, COUNT, COUNT, None], "and a drawn episode"
+    assert not (tmp_path / "parts.md").exists(), "no table is whole"
 
     rest = Doer()
-    parts = run("parts", rest)
-    assert (rest.kinds("train"), rest.kinds("evaluate")) == ({"hdril"}, {"hdril"}), "the others are in the report"
-    assert parts == run("whole", Doer())
+    parts = session(matrix, "parts", rest)
+    assert (rest.policies("train"), rest.policies("evaluate")) == (["act"] * 2, ["act"] * 2)
+    assert rest.policies("play") == []
+    assert parts == session(matrix, "whole", Doer())
     assert parts["runs"] == [], "the table has them"
 
-    monkeypatch.setattr("hdril.benchmark.engine.start", None)  # doing a step would fail
-    config = BenchmarkConfig(**vars(matrix), store=tmp_path / "none", document=tmp_path / "parts")
-    benchmark_command(config)
-    assert json.loads((tmp_path / "parts.json").read_text()) == parts
+    nothing = Doer()
+    assert session(matrix, "parts", nothing) == parts
+    assert nothing.begun == []
     capsys.readouterr()
-    benchmark_command(replace(config, plan=True))
+    session(matrix, "parts", nothing, plan=True)
     *lines, last = capsys.readouterr().out.splitlines()
-    assert last == "7 of 7 steps are done"
+    assert last == "14 of 14 steps are done"
     assert {line.split()[0] for line in lines} == {"kept"}
 
     again = Doer()
     with monkeypatch.context() as edited:
         edited.setattr("hdril.benchmark.steps.package_software", lambda package: {package: "another source"})
-        run("parts", again)
-    assert (again.kinds("train"), again.kinds("evaluate")) == ({"linear", "hdril"}, {"linear", "hdril"}), "not ACT's"
+        session(matrix, "parts", again)
+    assert set(again.policies("train")) == set(again.policies("evaluate")) == {"linear", "hdril"}, "not ACT's"
 
 
-def test_runs_that_no_table_asks_for_leave_the_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def run(title: str, doer: Doer, change: Callable[[dict[str, Any]], object]) -> None:
-        monkeypatch.setattr("hdril.benchmark.engine.start", doer.start)
-        document, store = tmp_path / "report", tmp_path / "store"
-        benchmark_command(BenchmarkConfig(**vars(changed(change)), store=store, document=document, only=[title]))
+def test_a_row_is_of_one_trained_policy(session: Callable[..., dict[str, Any]]) -> None:
+    """What is left of a training whose weights are lost is done again with new weights."""
+    matrix = changed(
+        lambda values: (
+            one_row(values),
+            values["tables"][0].update(data=["nominal"], evaluations=["nominal", "varied"], policies=["act", "hdril"]),
+        )
+    )
+    session(matrix, "report", Doer(broken=lambda step: (step.name, step.policy.name) == ("varied", "act")))
+    there = Doer("there")
+    (table,) = session(matrix, "report", there)["tables"]
+    assert there.policies("evaluate") == ["act"] * 4
+    act, hdril = (
+        [[run["made_from"]["train"]["digest"] for run in runs] for runs in row["cells"].values()]
+        for row in table["rows"]
+    )
+    assert act[0] == act[1]
+    assert hdril[0] == hdril[1]
+    whole = session(matrix, "whole", Doer("there"))["tables"][0]["rows"]
+    assert table["rows"][0] == whole[0]
+    assert table["rows"][1] != whole[1], "those weights are of the first machine"
 
-    def kept() -> list[str]:
-        return [run["command"] for run in json.loads((tmp_path / "report.json").read_text())["runs"]]
 
+def test_runs_that_no_table_asks_for_leave_the_report(
+    session: Callable[..., dict[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
     def without_act(values: dict[str, Any]) -> None:
         two_tables(values)
         values["tables"][0].update(policies=["linear", "hdril"])
 
-    with pytest.raises(UserError):
-        run("Lift", Doer(broken="hdril"), two_tables)
-    assert len(kept()) == 4
-    run("Again, nominal", Doer(), two_tables)
-    assert len(kept()) == 4, "what another table is made of stays"
-    run("Again, nominal", Doer(), without_act)
-    assert len(kept()) == 2
+    both, second = changed(two_tables), {"only": ["Again, nominal"]}
+    session(both, "report", Doer(broken=lambda step: step.policy.name == "hdril"), only=["Lift"])
+    assert len(session(both, "report", Doer(), **second)["runs"]) == 4, "what another table is made of stays"
+    assert "left the report" not in capsys.readouterr().out
+    assert len(session(changed(without_act), "report", Doer(), **second)["runs"]) == 2
+    assert "2 evaluations left the report, because no table asks for them" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("nothing_is_done")
@@ -1586,6 +1624,7 @@ def test_the_tables_of_the_published_pages_are_what_the_matrix_asks_for(page: Pa
     """A change of the definition, or of what a report needs, would drop rows that took hours."""
     matrix = read(ROOT / f"configs/benchmark/{page.stem}.yaml")
     before = json.loads(page.read_text())
+    results.kept_runs(before)  # older ones do not say how they were made
     kept = results.keep_tables(matrix, before | {"tables": []}, before)
     assert [table["title"] for table in kept["tables"]] == [table["title"] for table in before["tables"]]
     markdown(kept)
@@ -1675,6 +1714,7 @@ def test_on_slurm_jobs_share_the_steps_and_the_last_one_reports(
     assert not (tmp_path / "report.md").exists()
     pretend(Store(tmp_path / "store"), config.chosen, fails)
     shards.run(only=2)
+    assert len(json.loads((tmp_path / "report.json").read_text())["runs"]) == 6, "as soon as they are done"
     finish.run()
     assert (tmp_path / "report.md").read_text().startswith("# Benchmark: test\n")
     for options, words in (
