@@ -16,7 +16,20 @@ from lerobot_policy_hdril.planner import Planner, begin_weights
 from lerobot_policy_hdril.presets import PRESETS
 from torch import Tensor
 
-from tests.policies.tools import BATCH, FRAMES, SMALL, STARTS, assert_same, build, demonstrations, edit, read, tensors
+from tests.policies.tools import (
+    BATCH,
+    FRAMES,
+    SMALL,
+    STARTS,
+    Training,
+    assert_same,
+    build,
+    demonstrations,
+    edit,
+    observation,
+    read,
+    tensors,
+)
 
 AXES = ("x", "y", "z", "qx", "qy", "qz", "qw")
 NAMES = [f"{node}.{axis}" for node in ("left_ee", "right_ee", "cup") for axis in AXES] + ["cup.size"]
@@ -141,6 +154,20 @@ def test_the_planner_leaves_something_out_of_episodes_and_of_single_frames(metad
     policy.train().forward({"index": BATCH})
     policy.eval().forward({"index": BATCH})
     assert lengths == [FRAMES, 1, None, None]
+
+
+def test_a_later_primitive_that_looks_like_the_first_does_not_begin_an_episode(copy: Path) -> None:
+    """The hand comes back to where it was: what plays there is not what begins there. Here all frames of an episode look alike."""
+    for key in ("observation.state", "observation.environment_state"):
+        first: dict[int, Any] = {}
+        edit(copy, key, lambda episode, frame, value, first=first: first.setdefault(episode, value))
+    metadata = read(copy)
+    policy = build(metadata, preset="hdril_reactive", hidden_dim=32)
+    training = Training(policy)
+    for _ in range(100):
+        training.step(BATCH)
+    state = policy.eval()._state(observation(metadata, [FRAMES * episode for episode in range(6)]))
+    assert policy.choose(state, None).begin[:, 0].min() > 0.5
 
 
 def test_the_papers_models_and_once_a_primitive_have_the_plain_planner() -> None:

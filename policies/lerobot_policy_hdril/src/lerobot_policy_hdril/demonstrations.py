@@ -38,13 +38,14 @@ class Window:
     """The rest of a primitive from a frame on, for B samples, padded to M frames.
 
     ``seen`` (B, 1 + W, S) is the state at the start, and beside it W means of the last ones; ``elapsed`` (B,) how many
-    frames of the primitive are over by then; ``target`` (B, M, A + S) the actions and the states that they lead to;
-    ``mask`` (B, M) is True on real frames.
+    frames of the primitive are over by then, and ``first`` (B,) whether it is the first one of its episode; ``target``
+    (B, M, A + S) the actions and the states that they lead to; ``mask`` (B, M) is True on real frames.
     """
 
     seen: Tensor
     primitive: Tensor  # (B,)
     elapsed: Tensor
+    first: Tensor
     target: Tensor
     mask: Tensor
 
@@ -330,9 +331,10 @@ class Demonstrations:
         mask = steps < end[:, None]
         steps = torch.minimum(steps, end[:, None] - 1)
         # The last frame of an episode leads to a state that was not recorded: its own stands in.
-        last = self._episode_bounds[self.episode[rows], 1][:, None] - 1
+        opening, ending = self._episode_bounds[self.episode[rows]].unbind(-1)
+        last = ending[:, None] - 1
         target = torch.cat([self.action[steps], self.state[torch.minimum(steps + 1, last)]], dim=-1)
-        return Window(self.seen[start], self.label[start], elapsed, target, mask)
+        return Window(self.seen[start], self.label[start], elapsed, first == opening, target, mask)
 
     def history(self, rows: Tensor) -> History:
         """The whole episodes that the frames belong to."""

@@ -320,13 +320,16 @@ class HDRILPolicy(PreTrainedPolicy):
         """Cross-entropy over all frames of the episodes, in which rare beginnings count more in training (``planner_balance``),
         and the share of frames at which the most probable answer is the right one; plus cross-entropy over the frames at which
         windows start, each seen without what was before it. That is all that :meth:`predict_action_chunk` has where no episode
-        runs. ``generator`` draws what the planner leaves out, and which beginnings it is told late (``planner_late``): in
-        training, the numbers are of these episodes, and a late beginning counts at each of its frames."""
+        runs. With ``coordinates=fused`` it is asked that at the first frame of an episode alone: frames of a later primitive are
+        told to be such, because the last of them may look like a first one. ``generator`` draws what the planner leaves out, and
+        which beginnings it is told late (``planner_late``): in training, the numbers are of these episodes, and a late
+        beginning counts at each of its frames."""
         if generator is not None and self.config.planner_late:
             history = history.late(self.config.planner_late, generator)
         told = (history.playing, history.elapsed) if self.planner.steps else (None, None)
         nothing = torch.zeros_like(window.primitive)[:, None]
-        alone_told = (nothing + len(self.config.forms), nothing) if self.planner.steps else (None, None)
+        since = nothing if self.fused is None else torch.where(window.first[:, None], 0, self.planner.steps)
+        alone_told = (nothing + len(self.config.forms), since) if self.planner.steps else (None, None)
         logits, _ = self.planner(self.normalise(history.state), history.state, None, *told, generator)
         alone, _ = self.planner(
             self.normalise(window.state)[:, None], window.state[:, None], None, *alone_told, generator
