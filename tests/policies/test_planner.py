@@ -157,7 +157,7 @@ def test_the_planner_leaves_something_out_of_episodes_and_of_single_frames(metad
 
 
 def test_a_later_primitive_that_looks_like_the_first_does_not_begin_an_episode(copy: Path) -> None:
-    """The hand comes back to where it was: what plays there is not what begins there. Here all frames of an episode look alike."""
+    """A hand comes back to where it was: what plays there is not what begins there. Here all frames of an episode look alike."""
     for key in ("observation.state", "observation.environment_state"):
         first: dict[int, Any] = {}
         edit(copy, key, lambda episode, frame, value, first=first: first.setdefault(episode, value))
