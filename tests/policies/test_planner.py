@@ -15,6 +15,7 @@ from lerobot_policy_hdril.demonstrations import LATEST, History
 from lerobot_policy_hdril.planner import Planner, begin_weights
 from lerobot_policy_hdril.presets import PRESETS
 from torch import Tensor
+from torch.nn import functional as F
 
 from tests.policies.tools import (
     BATCH,
@@ -168,6 +169,32 @@ def test_a_later_primitive_that_looks_like_the_first_does_not_begin_an_episode(c
         training.step(BATCH)
     state = policy.eval()._state(observation(metadata, [FRAMES * episode for episode in range(6)]))
     assert policy.choose(state, None).begin[:, 0].min() > 0.5
+
+
+def test_single_frames_are_told_whether_they_are_of_a_first_primitive(metadata, monkeypatch) -> None:
+    """If not, it is told of them what it is told of no frame of an episode. Other policies may be asked about any frame alone."""
+    rows = torch.tensor([0, 9, 10, 69])
+    fused = build(metadata, preset="hdril_reactive", hidden_dim=32)
+    other = build(metadata, preset="hdril", replan_every=1, termination="learned", hidden_dim=32)
+    later = fused.planner.steps
+    for policy, expected in ((fused, [0, 0, later, later]), (other, [0, 0, 0, 0])):
+        calls, forward = [], policy.planner.forward
+
+        def watched(normalised, raw, memory=None, *told, forward=forward, calls=calls):
+            found = forward(normalised, raw, memory, *told)
+            calls.append((found[0], *told))
+            return found
+
+        monkeypatch.setattr(policy.planner, "forward", watched)
+        loss = policy.eval().forward({"index": rows})[1]["planner_loss"]
+        (whole, *_), (alone, playing, elapsed, _) = calls
+        assert playing[:, 0].tolist() == [len(policy.config.forms)] * 4, "that nothing plays"
+        assert elapsed[:, 0].tolist() == expected
+        history = demonstrations(policy).history(rows)
+        begins = torch.where(history.begins, history.primitive + 1, 0)
+        labels = demonstrations(policy).label[rows] + 1
+        both = F.cross_entropy(whole.flatten(0, 1), begins.flatten()) + F.cross_entropy(alone[:, 0], labels)
+        assert loss == pytest.approx(both.item(), abs=1e-5), "single frames count as much as episodes"
 
 
 def test_the_papers_models_and_once_a_primitive_have_the_plain_planner() -> None:

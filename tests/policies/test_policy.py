@@ -408,6 +408,9 @@ def test_windows_are_what_the_dataset_says(metadata) -> None:
     within = demonstrations.window(rows, stride=4, length=12)
     assert within.elapsed.tolist() == [4, 8, 0]
     assert within.mask.sum(1).tolist() == [8, 4, 12]
+    assert demonstrations.window(torch.tensor([0, 5, 9, 10, 70, 139]), 4, 12).first.tolist() == [
+        True, True, True, False, True, False,
+    ], "of the first primitive of their episodes, however far into it"  # fmt: skip
     torch.testing.assert_close(within.target[0, 0, :16], torch.tensor(data["action"][14]))
     history = demonstrations.history(rows)
     assert history.mask.all()
