@@ -60,7 +60,8 @@ def test_headline_numbers_are_those_of_the_benchmark() -> None:
     """README's and the first ones of the results, by the data of the page that has the commands."""
     tables = {table["title"]: table for table in json.loads((ROOT / "docs/benchmark/suite.json").read_text())["tables"]}
     readme, results = ((ROOT / name).read_text() for name in ("README.md", "docs/results.md"))
-    for title, task in HEADLINES.items():
+    few = {f"{title}, from 50 demonstrations": task for title, task in HEADLINES.items()}
+    for title, task in (HEADLINES | {title: task for title, task in few.items() if title in tables}).items():
         (row,) = tables[title]["rows"]
         for name, runs in row["cells"].items():
             (run,), level = runs, name.split(", ")[1]
@@ -69,7 +70,7 @@ def test_headline_numbers_are_those_of_the_benchmark() -> None:
             expert = run["n_episodes"] - run["n_expert_failures"]
             beside = f"{expert} | {run['pc_expert_choice']:.3g} % | {run['jerk_to_expert']:.2f}"
             assert f"| {task}, `{level}` | {row['demonstrations']} | {success} | {beside} |" in results
-            if level == "varied":
+            if level == "varied" and title in HEADLINES:
                 assert f"| {task}, everything varied | {row['demonstrations']} | {success} |" in readme
     nominal = json.loads((ROOT / "docs/benchmark/headline.json").read_text())["tables"]
     found = {}
