@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import asdict, replace
 from itertools import product
 from typing import Any
@@ -81,23 +81,45 @@ def kept_runs(report: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def usable(matrix: Matrix, table: TableSpec, store: Store, kept: Kept) -> dict[str, Mapping[str, Any]]:
-    """What a table takes from a report: all that it asks of a training, or nothing, so that a row is of one trained policy.
+    """What a table takes from a report: all that it asks of a training, or else what is of the weights that the store has. So a
+    row is of one trained policy: the same training may give other weights on another machine."""
+    taken: dict[str, Mapping[str, Any]] = {}
+    for training, recipes in _asked_of(matrix, table, store).items():
+        runs = {recipe: kept[recipe] for recipe in recipes if recipe in kept}
+        if not _whole(runs, recipes):
+            done = store.find(training)
+            runs = {recipe: run for recipe, run in runs.items() if done and _trained(run) == done.digest[:SHORT]}
+        taken |= runs
+    return taken
 
-    The same training on another machine gives other weights.
-    """
-    asked: dict[Train, list[str]] = {}
-    for row in rows(matrix, table):
-        for step in (step for evaluated in row.evaluations.values() for step in evaluated):
-            asked.setdefault(step.policy, []).append(store.recipe(step))
+
+def torn(matrix: Matrix, table: TableSpec, store: Store, kept: Kept) -> list[Train]:
+    """Trainings of which the report has a part of what a table asks. If they are done again and have the same weights, that part
+    is :func:`usable`."""
+    asked = _asked_of(matrix, table, store)
+    found = {training: {recipe: kept[recipe] for recipe in asked[training] if recipe in kept} for training in asked}
+    return [training for training, runs in found.items() if runs and not _whole(runs, asked[training])]
+
+
+def _asked_of(matrix: Matrix, table: TableSpec, store: Store) -> dict[Train, set[str]]:
+    """Recipes of what a table asks of each training."""
+    evaluated = [step for row in rows(matrix, table) for steps in row.evaluations.values() for step in steps]
+    asked: dict[Train, set[str]] = {step.policy: set() for step in evaluated}
+    for step in evaluated:
+        asked[step.policy].add(store.recipe(step))
     for step in drawn(matrix, table).values():
-        asked[step.evaluation.policy].append(store.recipe(step))
-    whole = [recipes for recipes in asked.values() if len({_trained(kept.get(recipe)) for recipe in recipes}) == 1]
-    return {recipe: kept[recipe] for recipes in whole for recipe in recipes if recipe in kept}
+        asked[step.evaluation.policy].add(store.recipe(step))
+    return asked
 
 
-def _trained(run: Mapping[str, Any] | None) -> str:
-    """Digest of the policy of a run; empty if there is none."""
-    return str(run["made_from"]["train"]["digest"]) if run else ""
+def _whole(runs: Kept, recipes: Set[str]) -> bool:
+    """Whether these are all runs of the recipes, and of the same weights."""
+    return runs.keys() == recipes and len({_trained(run) for run in runs.values()}) == 1
+
+
+def _trained(run: Mapping[str, Any]) -> str:
+    """Digest of the policy of a run."""
+    return str(run["made_from"]["train"]["digest"])
 
 
 def unfinished(matrix: Matrix, store: Store, results: Mapping[str, Any], runs: Kept) -> list[Mapping[str, Any]]:

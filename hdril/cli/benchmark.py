@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from hdril.benchmark.engine import Engine, Progress, in_order
 from hdril.benchmark.matrix import Matrix, all_steps
 from hdril.benchmark.page import numbers_file, write_numbers, write_report
 from hdril.benchmark.perform import is_running
-from hdril.benchmark.results import Kept, blank, collect, keep_tables, kept_runs, run_of, unfinished, usable
+from hdril.benchmark.results import Kept, blank, collect, keep_tables, kept_runs, run_of, torn, unfinished, usable
 from hdril.benchmark.steps import Evaluate, Play, Step
 from hdril.benchmark.store import Store
 from hdril.cli.common import run
@@ -88,18 +88,7 @@ def benchmark_command(config: BenchmarkConfig) -> None:
     if config.executor == "slurm":
         _submit(config)
         return
-    wanted = _left(config, store, kept)
-    with tqdm(total=len(in_order(wanted)), desc=config.name, unit="step") as bar:
-
-        def watch(step: Step, progress: Progress) -> None:
-            seconds = progress.remaining()
-            if progress.fresh:
-                bar.write(f"{store.get(step).seconds:6.0f} s  {step.title}")
-            _keep(config, store, step)
-            bar.set_postfix_str("" if seconds is None else f"about {_in_words(seconds)} left")
-            bar.update()
-
-        Engine(store, config.jobs, watch).run(wanted)
+    _do(config, store, kept, partial(_show, config, store))
     results, document = collect(config.chosen, store, kept), _document(config)
     with _alone(config):
         before = _report_before(config)
@@ -123,6 +112,28 @@ def _left(config: BenchmarkConfig, store: Store, kept: Kept) -> list[Step]:
         asked = all_steps(replace(config.chosen, tables=[table]))
         left |= dict.fromkeys(step for step in asked if store.recipe(step) not in had)
     return list(left)
+
+
+def _do(config: BenchmarkConfig, store: Store, kept: Kept, run: Callable[[list[Step]], None]) -> None:
+    """Do what is left: first the trainings of which the report has a part, whose weights decide what of that is left."""
+    if parts := [step for table in config.chosen.tables for step in torn(config, table, store, kept)]:
+        run(list(parts))
+    run(_left(config, store, kept))
+
+
+def _show(config: BenchmarkConfig, store: Store, wanted: list[Step]) -> None:
+    """Do steps, and show how far it is."""
+    with tqdm(total=len(in_order(wanted)), desc=config.name, unit="step") as bar:
+
+        def watch(step: Step, progress: Progress) -> None:
+            seconds = progress.remaining()
+            if progress.fresh:
+                bar.write(f"{store.get(step).seconds:6.0f} s  {step.title}")
+            _keep(config, store, step)
+            bar.set_postfix_str("" if seconds is None else f"about {_in_words(seconds)} left")
+            bar.update()
+
+        Engine(store, config.jobs, watch).run(wanted)
 
 
 def _keep(config: BenchmarkConfig, store: Store, step: Step) -> None:
@@ -178,7 +189,7 @@ def _submit(config: BenchmarkConfig) -> None:
 def _do_steps(config: BenchmarkConfig, rank: int, world_size: int) -> None:
     store = Store(config.store)
     engine = Engine(store, config.jobs, lambda step, progress: _keep(config, store, step))
-    engine.run(_left(config, store, kept_runs(_report_before(config))))
+    _do(config, store, kept_runs(_report_before(config)), engine.run)
 
 
 def _in_words(seconds: float) -> str:

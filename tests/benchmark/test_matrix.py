@@ -1567,14 +1567,21 @@ def test_an_evaluation_that_the_report_has_is_not_done_again(
 
 
 def test_a_row_is_of_one_trained_policy(session: Callable[..., dict[str, Any]]) -> None:
-    """What is left of a training whose weights are lost is done again with new weights."""
+    """What is left of a training whose weights are lost is done again with new weights; if they are the same, it is used."""
     matrix = changed(
         lambda values: (
             one_row(values),
             values["tables"][0].update(data=["nominal"], evaluations=["nominal", "varied"], policies=["act", "hdril"]),
         )
     )
-    session(matrix, "report", Doer(broken=lambda step: (step.name, step.policy.name) == ("varied", "act")))
+    broken = Doer(broken=lambda step: (step.name, step.policy.name) == ("varied", "act"))
+    session(matrix, "same", broken)
+    here = Doer()
+    assert session(matrix, "same", here)["tables"] == session(matrix, "other", Doer())["tables"]
+    assert (here.policies("train"), [step.name for step in here.begun if isinstance(step, Evaluate)]) == (
+        ["act"] * 2, ["varied"] * 2,
+    )  # fmt: skip
+    session(matrix, "report", broken)
     there = Doer("there")
     (table,) = session(matrix, "report", there)["tables"]
     assert there.policies("evaluate") == ["act"] * 4
