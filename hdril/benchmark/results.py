@@ -46,7 +46,7 @@ _LATER: dict[str, Any] = {
 
 
 Kept = Mapping[str, Mapping[str, Any]]
-"""What a report has of steps, by their recipes: evaluations and drawn episodes."""
+"""Evaluations and drawn episodes that a report has, by their recipes."""
 _RUN_SHAPE = 1
 """Of these as data. It counts up when one of them is told in another way: reports of before are read from the store again."""
 
