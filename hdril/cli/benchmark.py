@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
@@ -23,6 +24,7 @@ from hdril.benchmark.steps import Evaluate, Play, Step
 from hdril.benchmark.store import Store
 from hdril.cli.common import run
 from hdril.cli.shards import log_folder
+from hdril.errors import UserError
 from hdril.evaluation.checkpoint import read_json
 from hdril.execution import SlurmConfig, check_execution, submit_to_slurm
 from hdril.files import LOCK, is_busy
@@ -40,8 +42,8 @@ class BenchmarkConfig(Matrix):
     store: Path = Path("outputs/benchmark/store")
     """Folder of all results."""
     document: Path | None = None
-    """Where the report goes, without suffix: .html, .md, .json and figures. Default: outputs/benchmark/<name>/<name>. Give a new
-    one to do again what an old one has."""
+    """Where the report goes, without suffix: .html, .md, .json and figures. Default: outputs/benchmark/<name>/<name>. To do
+    again what one has, give another, and another store."""
     only: list[str] = field(default_factory=list)
     """Titles of tables to do, ["Table lift"]; all unless given. The others stay in the report as it has them, if their definition
     has not changed."""
@@ -100,7 +102,7 @@ def benchmark_command(config: BenchmarkConfig) -> None:
     if gone:
         print(f"No longer in the report, because they are asked for in another way now: {', '.join(gone)}")
     if stale := len(kept_runs(before).keys() - kept_runs(results).keys()):
-        print(f"{stale} evaluations left the report, because no table asks for them with these options and versions")
+        print(f"Evaluations that left the report, as no table asks for them with these options and versions: {stale}")
     print(f"Report: {document}.html, and as Markdown beside it")
 
 
@@ -117,7 +119,8 @@ def _left(config: BenchmarkConfig, store: Store, kept: Kept) -> list[Step]:
 def _do(config: BenchmarkConfig, store: Store, kept: Kept, run: Callable[[list[Step]], None]) -> None:
     """Do what is left: first the trainings of which the report has a part, whose weights decide what of that is left."""
     if parts := [step for table in config.chosen.tables for step in torn(config, table, store, kept)]:
-        run(list(parts))
+        with suppress(UserError):  # it fails again below, and keeps back nothing else there
+            run(list(parts))
     run(_left(config, store, kept))
 
 

@@ -320,10 +320,10 @@ class HDRILPolicy(PreTrainedPolicy):
         """Cross-entropy over all frames of the episodes, in which rare beginnings count more in training (``planner_balance``),
         and the share of frames at which the most probable answer is the right one; plus cross-entropy over the frames at which
         windows start, each seen without what was before it. That is all that :meth:`predict_action_chunk` has where no episode
-        runs. With ``coordinates=fused`` it is asked that at the first frame of an episode alone: frames of a later primitive are
-        told to be such, because the last of them may look like a first one. ``generator`` draws what the planner leaves out, and
-        which beginnings it is told late (``planner_late``): in training, the numbers are of these episodes, and a late
-        beginning counts at each of its frames."""
+        runs. With ``coordinates=fused``, where that raises, and ``termination=learned``, the planner is asked so where an episode
+        begins, and nowhere else: of frames of a later primitive it is told that they are such, because the last of them may look
+        like a first one. ``generator`` draws what the planner leaves out, and which beginnings it is told late
+        (``planner_late``): in training, the numbers are of these episodes, and a late beginning counts at each of its frames."""
         if generator is not None and self.config.planner_late:
             history = history.late(self.config.planner_late, generator)
         told = (history.playing, history.elapsed) if self.planner.steps else (None, None)
