@@ -28,7 +28,7 @@ from hdril.benchmark.page import write_report
 from hdril.benchmark.perform import Assignment
 from hdril.benchmark.report import markdown
 from hdril.benchmark.results import collect
-from hdril.benchmark.steps import Calibrate, Evaluate, Play, Record, Step
+from hdril.benchmark.steps import Calibrate, Evaluate, Play, Record, Step, Train
 from hdril.benchmark.store import Store
 from hdril.cli.benchmark import BenchmarkConfig, benchmark_command
 from hdril.demonstrations.read import read_episode
@@ -1473,16 +1473,19 @@ def test_a_report_grows_table_by_table(tmp_path: Path) -> None:
 
 class Doer:
     """Does steps in no time, on a machine of its own, where trainings end in other weights. Evaluations that are ``broken``
-    fail."""
+    fail, and so do trainings of the policy that is ``untrainable``."""
 
-    def __init__(self, machine: str = "here", broken: Callable[[Evaluate], bool] = lambda step: False) -> None:
-        self.machine, self.broken = machine, broken
+    def __init__(
+        self, machine: str = "here", broken: Callable[[Evaluate], bool] = lambda step: False, untrainable: str = ""
+    ) -> None:
+        self.machine, self.broken, self.untrainable = machine, broken, untrainable
         self.begun: list[Step] = []
 
     def start(self, assignment: Assignment) -> Doing:
         """In place of :func:`hdril.benchmark.perform.start`."""
         step = assignment.step
-        if isinstance(step, Evaluate) and self.broken(step):
+        fails_here = isinstance(step, Train) and step.name == self.untrainable
+        if fails_here or (isinstance(step, Evaluate) and self.broken(step)):
             return Doing(1)
         self.begun.append(step)
         command = step.command(assignment.place / "result", assignment.inputs)
@@ -1581,6 +1584,11 @@ def test_a_row_is_of_one_trained_policy(session: Callable[..., dict[str, Any]]) 
     assert (here.policies("train"), [step.name for step in here.begun if isinstance(step, Evaluate)]) == (
         ["act"] * 2, ["varied"] * 2,
     )  # fmt: skip
+    one_left = Doer(broken=lambda step: step.name == "varied" or step.policy.name == "hdril")
+    session(matrix, "blocked", one_left)
+    fails_again = Doer(untrainable="act")
+    session(matrix, "blocked", fails_again)
+    assert fails_again.policies("evaluate") == ["hdril"] * 4, "what is not made from it is done"
     session(matrix, "report", broken)
     there = Doer("there")
     (table,) = session(matrix, "report", there)["tables"]
