@@ -167,7 +167,7 @@ def bench_action(root: Path) -> list[Figure]:
     """One ``select_action`` of the default policy on one core, averaged over an episode and the slowest of one.
 
     It is shown a demonstration, after enough training for its planner to follow. A policy makes a plan whenever a primitive
-    begins, and an untrained planner begins one at every frame.
+    begins, and an untrained planner begins them as often as it may.
     """
     import torch
     from lerobot.datasets.lerobot_dataset import LeRobotDataset

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +11,7 @@ import torch
 from lerobot_policy_hdril import HDRILPolicy
 from lerobot_policy_hdril.player import Choice, PlaybackState, advance
 
-from tests.policies.tools import BATCH, FRAMES, STARTS, Training, build, observation
+from tests.policies.tools import BATCH, FRAMES, STARTS, Training, build, edit, observation, read
 
 SHORTEST, LONGEST = [3, 2, 4], [5, 6, 4]
 
@@ -214,6 +215,22 @@ def test_primitives_of_varying_length_are_played_within_their_lengths(varied, mo
     for name, length in runs[:-1]:
         low, high = lengths[policy.config.primitives.index(name)]
         assert low <= length <= high
+
+
+def test_a_run_that_the_episode_cuts_is_no_shortest_one(copy: Path) -> None:
+    """The last primitive also plays in the middle of one episode, for nine frames, and the end of another leaves one of it."""
+    last = STARTS[-1]
+
+    def label(episode: int, frame: int, value: int) -> int:
+        if episode == 0:
+            return 5 if 36 <= frame < 45 else min(value, 4)
+        return min(value, 4) if episode == 1 and frame < FRAMES - 1 else value
+
+    edit(copy, "subtask_index", label)
+    edit(copy, "subtask_start", lambda episode, frame, value: value or (episode == 0 and frame in (36, 45)))
+    whole = read(copy)
+    lengths = build(whole).config.primitive_lengths
+    assert lengths[5] == [9, FRAMES - last]
 
 
 def test_open_loop_does_not_look(metadata) -> None:

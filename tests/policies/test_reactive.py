@@ -77,11 +77,18 @@ class Deciding(Scripted):
         return Choice(begin, None if previous is None else torch.tensor([go_on]), torch.zeros(1, 1, 1))
 
 
-def test_the_planner_decides_at_any_frame_what_goes_on_and_what_begins() -> None:
-    wishes = [(0, 0.0), (1, 0.9), (1, 0.1), (1, 0.8), (1, 0.2), (0, 0.0)]
-    states = play(Deciding(wishes), 6)
-    assert [(int(s.primitive), int(s.elapsed)) for s in states] == [(0, 0), (0, 1), (1, 0), (1, 1), (1, 0), (0, 0)]
+def test_the_planner_decides_what_goes_on_and_what_begins() -> None:
+    wishes = [(0, 0.0), (1, 0.9), (1, 0.9), (1, 0.1), (1, 0.8), (1, 0.2), (0, 0.9), (0, 0.0)]
+    states = play(Deciding(wishes), 8)
+    played = [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 0), (1, 1), (0, 0)]
+    assert [(int(s.primitive), int(s.elapsed)) for s in states] == played
     assert states[-1].begun.tolist() == [[2, 2, 0]]
+
+
+@pytest.mark.parametrize("wish", [0, 1])
+def test_a_primitive_goes_on_as_long_as_all_demonstrations_do_whatever_the_planner_says(wish: int) -> None:
+    states = play(Deciding([(0, 0.0)] + [(wish, 0.1)] * 3), 4)
+    assert [(int(s.primitive), int(s.elapsed)) for s in states] == [(0, 0), (0, 1), (0, 2), (wish, 0)]
 
 
 def test_a_primitive_ends_at_its_longest_length_whatever_the_planner_says() -> None:

@@ -85,8 +85,8 @@ class HDRILConfig(SingleFrameConfig):
     :class:`~lerobot_policy_hdril.hand_noise.HandNoise`. For ``coordinates=fused`` alone; it is 0 with others."""
     termination: Termination = "learned"
     """When a primitive is over. ``length``: after its shortest recorded length, as soon as the planner prefers another.
-    ``learned``: the planner decides at every frame whether it goes on or one begins, maybe the same again; for
-    demonstrations in which primitives are broken off and repeated."""
+    ``learned``: from that length on, the planner decides at every frame whether it goes on or one begins, maybe the same
+    again; for demonstrations in which primitives are broken off and repeated."""
     split_forms: bool = True
     """Whether a primitive that begins with a hand closed, or another number of the actions that is no pose in the other half of
     its range, has a model of its own (:mod:`~lerobot_policy_hdril.forms`). For ``coordinates=fused`` alone; it is false with

@@ -288,11 +288,15 @@ class Demonstrations:
         return Replay(self.state[first], self.action[torch.minimum(steps, end[:, None] - 1)])
 
     def lengths(self, episodes: Tensor) -> list[list[int]]:
-        """Shortest and longest run of each primitive in these episodes, frames; [0, 0] for one that is not among them."""
+        """Shortest and longest run of each primitive in these episodes, frames; [0, 0] for one that is not among them.
+
+        A run at the end of an episode may be cut by it: it is the shortest only if the primitive has no other.
+        """
         bounds = self._segment_bounds[episodes[self.episode[self._segment_bounds[:, 0]]]]
         lengths, labels = bounds[:, 1] - bounds[:, 0], self.label[bounds[:, 0]]
-        runs = [lengths[labels == k] for k in range(len(self.forms))]
-        return [[int(run.min()), int(run.max())] if len(run) else [0, 0] for run in runs]
+        whole = bounds[:, 1] < self._episode_bounds[self.episode[bounds[:, 0]], 1]
+        runs = [(lengths[labels == k], lengths[(labels == k) & whole]) for k in range(len(self.forms))]
+        return [[int((inner if len(inner) else run).min()), int(run.max())] if len(run) else [0, 0] for run, inner in runs]
 
     def beginnings(self, episodes: Tensor) -> Tensor:
         """How often each primitive begins after each, and first of all (K + 1, K), in these episodes."""

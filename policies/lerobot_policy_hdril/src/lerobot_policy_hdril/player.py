@@ -92,9 +92,9 @@ class PlaybackState:
 def advance(policy: Predictor, previous: PlaybackState | None, observed: Tensor) -> PlaybackState:
     """The next frame of episodes, of which ``observed`` (B, S) is seen; ``previous`` is None at their start.
 
-    The planner is asked at every frame. A primitive is over after its longest recorded length; before that, if the planner
-    decides so (``termination=learned``), or from its shortest length on as soon as the planner prefers another. The same one
-    may be next, unless the planner's doubts have added up (``least_survival``): then it is given up for another.
+    The planner is asked at every frame. From its shortest recorded length on, a primitive is over as soon as the planner
+    prefers another, or, with ``termination=learned``, says that one begins; after its longest length it is over in any case.
+    The same one may be next, unless the planner's doubts have added up (``least_survival``): then it is given up for another.
 
     A plan is made at the start of a primitive, and every ``replan_every`` frames; within a primitive, the last ``plan_overlap``
     frames of the plan before fade into it. In an open loop the state that was predicted for this frame takes the place of the
@@ -143,11 +143,8 @@ def _next_primitive(
     if previous is None:
         return best, torch.zeros_like(best), torch.full_like(best, -1)
     playing, elapsed = previous.primitive, previous.elapsed + 1
-    over = elapsed >= policy.longest_length[playing]
-    if choice.go_on is None:
-        over |= (elapsed >= policy.shortest_length[playing]) & (best != playing)
-    else:
-        over |= highest > choice.go_on
+    wanted = best != playing if choice.go_on is None else highest > choice.go_on
+    over = (elapsed >= policy.longest_length[playing]) | (wanted & (elapsed >= policy.shortest_length[playing]))
     gave_up = torch.zeros_like(over)
     if policy.config.least_survival:
         gave_up = over & (best == playing) & (doubt.sum(-1) > -math.log(policy.config.least_survival))
