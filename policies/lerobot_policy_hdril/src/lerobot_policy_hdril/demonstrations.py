@@ -296,7 +296,9 @@ class Demonstrations:
         lengths, labels = bounds[:, 1] - bounds[:, 0], self.label[bounds[:, 0]]
         whole = bounds[:, 1] < self._episode_bounds[self.episode[bounds[:, 0]], 1]
         runs = [(lengths[labels == k], lengths[(labels == k) & whole]) for k in range(len(self.forms))]
-        return [[int((inner if len(inner) else run).min()), int(run.max())] if len(run) else [0, 0] for run, inner in runs]
+        return [
+            [int((inner if len(inner) else run).min()), int(run.max())] if len(run) else [0, 0] for run, inner in runs
+        ]
 
     def beginnings(self, episodes: Tensor) -> Tensor:
         """How often each primitive begins after each, and first of all (K + 1, K), in these episodes."""
