@@ -218,8 +218,7 @@ def test_primitives_of_varying_length_are_played_within_their_lengths(varied, mo
 
 
 def test_a_run_that_the_episode_cuts_is_no_shortest_one(copy: Path) -> None:
-    """The last primitive also plays in the middle of one episode, for nine frames, and the end of another leaves one of it."""
-    last = STARTS[-1]
+    """The last primitive also plays in the middle of one episode, for nine frames. The end of another leaves one frame of it."""
 
     def label(episode: int, frame: int, value: int) -> int:
         if episode == 0:
@@ -228,9 +227,13 @@ def test_a_run_that_the_episode_cuts_is_no_shortest_one(copy: Path) -> None:
 
     edit(copy, "subtask_index", label)
     edit(copy, "subtask_start", lambda episode, frame, value: value or (episode == 0 and frame in (36, 45)))
-    whole = read(copy)
-    lengths = build(whole).config.primitive_lengths
-    assert lengths[5] == [9, FRAMES - last]
+    assert build(read(copy)).config.primitive_lengths[5] == [9, FRAMES - STARTS[-1]]
+
+
+def test_a_primitive_that_only_ends_episodes_has_the_lengths_of_its_last_runs(varied) -> None:
+    # `vary_lengths` begins the last primitive up to three frames later.
+    last = [FRAMES - STARTS[-1] - (episode + 10) % 4 for episode in range(6)]
+    assert build(varied).config.primitive_lengths[5] == [min(last), max(last)]
 
 
 def test_open_loop_does_not_look(metadata) -> None:

@@ -113,6 +113,32 @@ def test_a_primitive_that_would_begin_again_is_given_up_when_doubts_have_added_u
         assert (int(states[given_up].elapsed), states[given_up].doubt.tolist()) == (0, [[0.0, 0.0, 0.0]])
 
 
+def test_doubts_count_while_a_primitive_goes_on_in_any_case() -> None:
+    # Its shortest length is two frames: what the planner says after the first of them does not end it, and is not forgotten.
+    wishes = [(0, 0.0), (1, 0.9), (1, 0.9), (1, 0.1), (0, 0.2), (1, 0.1)]
+    states = play(Deciding(wishes, least_survival=0.3), 6)
+    assert [(int(s.primitive), int(s.elapsed)) for s in states] == [(0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (0, 0)]
+    assert states[-1].gave_up.tolist() == [1]
+
+
+@pytest.mark.parametrize("wishes", [[(0, 0.0)] + [(1, 0.1)] * 3, [(1, 0.0)] + [(0, 0.1)] * 3])
+def test_rows_of_a_batch_have_the_shortest_lengths_of_their_own_primitives(wishes: list[tuple[int, float]]) -> None:
+    class Both(Scripted):
+        def choose(self, state, previous):
+            pair = next(self.wishes)
+            begin = torch.stack([(1.0 - go) * F.one_hot(torch.tensor(wish), 3).float() for wish, go in pair])
+            go_on = None if previous is None else torch.tensor([go for _, go in pair])
+            return Choice(begin, go_on, torch.zeros(1, 2, 1))
+
+    mirrored = [(1 - wish, go) for wish, go in wishes]
+    both: Any = [list(pair) for pair in zip(wishes, mirrored, strict=True)]
+    together = play(Both(both), len(wishes), 2)
+    for row, alone in enumerate((wishes, mirrored)):
+        single = play(Deciding(alone), len(alone))
+        expected = [(int(s.primitive), int(s.elapsed)) for s in single]
+        assert [(int(s.primitive[row]), int(s.elapsed[row])) for s in together] == expected
+
+
 def test_doubts_do_not_end_a_primitive_that_goes_on_and_end_with_it() -> None:
     policy = Deciding([(0, 0.0), (1, 0.6), (1, 0.6), (1, 0.6), (2, 0.3), (2, 0.9)], least_survival=0.9)
     states = play(policy, 6)
