@@ -2,8 +2,8 @@
 
 Each stage is one command that a user could type; it is printed before it runs. A stage whose result is there is skipped, so
 an interrupted demo continues where it stopped. A result is kept only while it was made by the same command from the same input
-files: next to each output folder is a file ``<folder>.made_from`` that says what it is made from. So a policy that was trained
-again is evaluated again.
+files by the same software: next to each output folder is a file ``<folder>.made_from`` that says what it is made from. So a
+policy that was trained again is evaluated again.
 """
 
 from __future__ import annotations
@@ -16,10 +16,12 @@ import shutil
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from hdril.digest import digest_file
+from hdril.evaluation.software import evaluation_software, package_software, recording_software
 
 CONFIG = Path("configs/train/table_lift.yaml")
 
@@ -34,6 +36,8 @@ class Stage:
     result: Path
     inputs: tuple[Path, ...] = ()
     """Files that the result is made from."""
+    software: Mapping[str, str] = field(default_factory=dict)
+    """Versions and digests of the sources that decide the result."""
     threads: int | None = None
     """Threads of PyTorch; PyTorch's own choice unless given."""
     resumes: bool = True
@@ -69,9 +73,9 @@ class Stage:
         return self.output.with_name(f"{self.output.name}.made_from")
 
     def _made_from(self) -> str:
-        """The command and the digests of the inputs, as JSON."""
+        """The command, the digests of the inputs and the software, as JSON."""
         digests = {str(path): digest_file(path) for path in self.inputs}
-        return json.dumps({"command": self.command, "inputs": digests}, indent=1)
+        return json.dumps({"command": self.command, "inputs": digests, "software": dict(self.software)}, indent=1)
 
     def _remove(self, made_from: str) -> None:
         """Remove the result of something else and the rest of an interrupted run, and record what is made now."""
@@ -92,6 +96,8 @@ def stages(output: Path, episodes: int, steps: int, evaluations: int) -> list[St
     """The pipeline. ``output`` is where everything goes."""
     dataset, train = output / "dataset", output / "train"
     policy = train / "checkpoints" / "last" / "pretrained_model"
+    learner = package_software("lerobot_policy_hdril")
+    played = learner | evaluation_software("table_lift")
     return [
         Stage(
             f"{episodes} demonstrations",
@@ -99,6 +105,7 @@ def stages(output: Path, episodes: int, steps: int, evaluations: int) -> list[St
              f"--num_episodes={episodes}"),
             dataset,
             dataset / "meta" / "info.json",
+            software=recording_software("table_lift"),
         ),
         Stage(
             f"HDR-IL: training, {steps} steps",
@@ -107,6 +114,7 @@ def stages(output: Path, episodes: int, steps: int, evaluations: int) -> list[St
             train,
             train / "checkpoints" / f"{steps:06d}" / "pretrained_model" / "model.safetensors",
             (CONFIG, dataset / "meta" / "info.json", dataset / "meta" / "stats.json"),
+            software=learner,
             threads=1,  # the matrices are small: a second thread slows training down
             resumes=False,  # lerobot-train refuses the folder that it left
         ),
@@ -118,6 +126,7 @@ def stages(output: Path, episodes: int, steps: int, evaluations: int) -> list[St
             output / "lerobot-eval",
             output / "lerobot-eval" / "eval_info.json",
             weights(policy),
+            played,
             resumes=False,
         ),
         Stage(
@@ -127,6 +136,7 @@ def stages(output: Path, episodes: int, steps: int, evaluations: int) -> list[St
             output / "eval",
             output / "eval" / "results.json",
             weights(policy),
+            played,
         ),
     ]  # fmt: skip
 

@@ -151,3 +151,20 @@ def test_records_say_what_a_result_is_made_from(run_demo: Demo) -> None:
     record = json.loads(Path("out/eval.made_from").read_text())
     assert record["command"][0] == "hdril-eval"
     assert set(record["inputs"]) == {str(POLICY / name) for name in ("model.safetensors", "config.json")}
+
+
+@pytest.mark.parametrize(
+    ("name", "again"),
+    [
+        ("recording_software", ["hdril-record"]),
+        ("package_software", ["lerobot-train 1", *EVALUATIONS]),
+        ("evaluation_software", EVALUATIONS),
+    ],
+)
+def test_results_of_other_software_are_made_again(
+    run_demo: Demo, monkeypatch: pytest.MonkeyPatch, name: str, again: list[str]
+) -> None:
+    run_demo()
+    monkeypatch.setattr(demo, name, lambda _: {"hdril": "of later"})
+    assert run_demo() == again
+    assert run_demo() == []
