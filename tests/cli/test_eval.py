@@ -76,7 +76,8 @@ def test_an_action_that_is_not_finite_is_named(checkpoint: Path, tmp_path: Path)
         (["--policy.rollout=backwards"], "argument policy.rollout: invalid choice: 'backwards'"),
         (
             ["--policy.hidden_dim=64"],
-            "policy.hidden_dim cannot change an evaluation; what can: experts, least_survival, replan_every, rollout, samples",
+            "policy.hidden_dim cannot change an evaluation; "
+            "what can: experts, least_survival, repeat_discount, replan_every, rollout, samples",
         ),
         (["--policy.repo_id=a/b"], "policy.repo_id cannot change an evaluation; what can: "),
         (["--max_frames=69"], "max_frames must be at least 70, the horizon of table_lift"),

@@ -128,11 +128,15 @@ def test_each_option_of_hdril_acts_or_is_refused(name: str, hdril: Path) -> None
         "rollout": "open_loop",
         "samples": "0",
         "least_survival": "0.0",
+        "repeat_discount": "0.0",
     }
     if name in acting:
         assert str(vars(resolve_config(found, (f"--{name}={acting[name]}",)))[name]) == acting[name]
         return
-    message = rf"^policy\.{name} cannot change an evaluation; what can: experts, least_survival, replan_every, rollout, samples$"
+    message = (
+        rf"^policy\.{name} cannot change an evaluation; "
+        "what can: experts, least_survival, repeat_discount, replan_every, rollout, samples$"
+    )
     with pytest.raises(ValueError, match=message):
         resolve_config(found, (f"--{name}=1",))
 

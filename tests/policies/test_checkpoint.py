@@ -241,12 +241,13 @@ def test_checkpoint_from_before_the_second_scale_acts_without_it(metadata, tmp_p
 def test_checkpoint_from_before_plans_overlapped_and_primitives_were_given_up_acts_as_it_did(
     metadata, tmp_path: Path
 ) -> None:
-    saved = build(metadata, preset="hdril_reactive", plan_overlap=0, least_survival=0.0).eval()
+    saved = build(metadata, preset="hdril_reactive", plan_overlap=0, least_survival=0.0, repeat_discount=0.0).eval()
     saved.save_pretrained(tmp_path / "older")
-    without(tmp_path / "older", ["plan_overlap", "least_survival"])
+    without(tmp_path / "older", ["plan_overlap", "least_survival", "repeat_discount"])
     older = load(tmp_path / "older")
-    assert older.config.plan_overlap == older.config.least_survival == 0
+    assert older.config.plan_overlap == older.config.least_survival == older.config.repeat_discount == 0
     assert load(tmp_path / "older", "--least_survival=0.3").config.least_survival == 0.3
+    assert load(tmp_path / "older", "--repeat_discount=0.5").config.repeat_discount == 0.5
     for frame in range(4):
         seen = observation(metadata, [frame])
         assert torch.equal(older.select_action(seen), saved.select_action(seen))

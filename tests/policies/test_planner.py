@@ -198,7 +198,14 @@ def test_single_frames_are_told_whether_they_are_of_a_first_primitive(metadata, 
 
 
 def test_the_papers_models_and_once_a_primitive_have_the_plain_planner() -> None:
-    options = ("planner_balance", "planner_dropout", "planner_late", "planner_scale", "least_survival")
+    options = (
+        "planner_balance",
+        "planner_dropout",
+        "planner_late",
+        "planner_scale",
+        "least_survival",
+        "repeat_discount",
+    )
     other = {name for name, values in PRESETS.items() if any(values[option] for option in options)}
     assert other == {"hdril_reactive", "network_reactive"}
 

@@ -24,7 +24,14 @@ class Scripted:
 
     def __init__(self, wishes: list[list[int]], **config) -> None:
         self.config = SimpleNamespace(
-            **{"rollout": "closed_loop", "replan_every": 0, "plan_overlap": 0, "least_survival": 0.0, "filters": []}
+            **{
+                "rollout": "closed_loop",
+                "replan_every": 0,
+                "plan_overlap": 0,
+                "least_survival": 0.0,
+                "repeat_discount": 0.0,
+            }
+            | {"filters": []}
             | config
         )
         self.shortest_length, self.longest_length = torch.tensor(SHORTEST), torch.tensor(LONGEST)

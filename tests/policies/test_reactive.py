@@ -165,6 +165,46 @@ def test_doubts_of_one_episode_are_not_anothers_and_the_last_frame_counts() -> N
     assert states[4].doubt[:, 1].tolist() == pytest.approx([0.0, -4.0 * math.log(0.8)])
 
 
+class Torn(Scripted):
+    """It says the same at every frame: how probable the beginning of each primitive is, which never goes on."""
+
+    def __init__(self, says: list[list[float]], **config: Any) -> None:
+        super().__init__([], **config)
+        self.says, self.shortest_length = torch.tensor(says), torch.ones(3, dtype=torch.long)
+
+    def choose(self, state, previous):
+        rows = len(self.says)
+        return Choice(self.says, None if previous is None else torch.zeros(rows), torch.zeros(1, rows, 1))
+
+
+@pytest.mark.parametrize(
+    ("discount", "begun"), [(0.0, [1, 1, 1, 1, 1, 1]), (0.3, [1, 1, 0, 1, 0, 1]), (0.5, [1, 0, 1, 0, 1, 2])]
+)
+def test_what_has_begun_before_counts_for_less_where_a_primitive_begins(discount: float, begun: list[int]) -> None:
+    states = play(Torn([[0.35, 0.55, 0.1]], repeat_discount=discount), 6)
+    assert [int(s.primitive) for s in states] == begun
+    assert all(int(s.elapsed) == 0 for s in states)
+    assert states[-1].probabilities.tolist() == [pytest.approx([0.35, 0.55, 0.1])], "the planner's own"
+
+
+def test_what_has_begun_often_is_chosen_again_where_the_planner_is_sure() -> None:
+    states = play(Torn([[0.01, 0.99, 0.0]], repeat_discount=0.5), 20)
+    assert [int(s.primitive) for s in states] == [1] * 20
+
+
+def test_what_has_begun_before_does_not_keep_what_plays_from_going_on_or_another_from_beginning() -> None:
+    wishes = [(0, 0.0), (1, 0.9), (1, 0.9), (1, 0.4), (0, 0.6), (0, 0.4), (0, 0.6), (0, 0.6)]
+    discounted, plain = (play(Deciding(wishes, repeat_discount=share), len(wishes)) for share in (0.9, 0.0))
+    assert [(int(s.primitive), int(s.elapsed)) for s in discounted] == [
+        (int(s.primitive), int(s.elapsed)) for s in plain
+    ]
+
+
+def test_what_has_begun_in_one_episode_of_a_batch_does_not_count_in_another() -> None:
+    states = play(Torn([[0.35, 0.55, 0.1], [0.8, 0.15, 0.05]], repeat_discount=0.5), 4, 2)
+    assert [s.primitive.tolist() for s in states] == [[1, 0], [0, 0], [1, 0], [0, 1]]
+
+
 def test_what_goes_on_counts_as_the_primitive_that_plays() -> None:
     states = play(Deciding([(0, 0.0), (1, 0.75)]), 2)
     assert states[1].probabilities.tolist() == [[0.75, 0.25, 0.0]]

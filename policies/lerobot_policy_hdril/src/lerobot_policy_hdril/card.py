@@ -28,8 +28,8 @@ CITATION = """@inproceedings{xie2020deep,
 }"""
 _CHOICES = ("preset", "interaction", "skip", "state_skip", "per_primitive", "decoder", "coordinates", "latent", "termination",
             "filter_frames", "long_filter_frames", "robust", "hand_noise", "fourier_features", "split_forms", "planner_balance",
-            "planner_dropout", "planner_late", "planner_scale", "least_survival", "rollout", "replan_every", "plan_overlap",
-            "hidden_dim")  # fmt: skip
+            "planner_dropout", "planner_late", "planner_scale", "least_survival", "repeat_discount", "rollout", "replan_every",
+            "plan_overlap", "hidden_dim")  # fmt: skip
 
 
 def simulated_task(config: HDRILConfig, dataset_meta: LeRobotDatasetMetadata | None) -> str | None:

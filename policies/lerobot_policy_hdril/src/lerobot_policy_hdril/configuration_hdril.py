@@ -29,7 +29,8 @@ Termination = Literal["length", "learned"]
 
 _FREE = (
     "hidden_dim", "termination", "filter_frames", "long_filter_frames", "robust", "hand_noise", "split_forms",
-    "planner_balance", "planner_dropout", "planner_late", "planner_scale", "least_survival", "replan_every", "plan_overlap",
+    "planner_balance", "planner_dropout", "planner_late", "planner_scale", "least_survival", "repeat_discount", "replan_every",
+    "plan_overlap",
 )  # fmt: skip
 """Options that may differ from the preset's value."""
 _FILTERS = ("filter_frames", "long_filter_frames")
@@ -61,8 +62,8 @@ class HDRILConfig(SingleFrameConfig):
     """Name of a model in :data:`~lerobot_policy_hdril.presets.PRESETS`, which then decides the values of this group, and
     ``hidden_dim``. ``hidden_dim``, ``termination``, ``filter_frames``, ``long_filter_frames``, ``robust``, ``hand_noise``,
     ``split_forms``, ``planner_balance``, ``planner_dropout``, ``planner_late``, ``planner_scale``, ``least_survival``,
-    ``replan_every`` and ``plan_overlap`` may be given nevertheless, where the model has a use for them. Empty to set them one by
-    one. Once the policy has learned it is a name only."""
+    ``repeat_discount``, ``replan_every`` and ``plan_overlap`` may be given nevertheless, where the model has a use for them.
+    Empty to set them one by one. Once the policy has learned it is a name only."""
     interaction: Interaction = "object"
     """Graph attention: ``none``; ``scalar``, the paper's node per number of the state; ``object``, a node per object."""
     skip: bool = True
@@ -113,6 +114,10 @@ class HDRILConfig(SingleFrameConfig):
     began is at least this. If it is less, the primitive is given up for what would most probably have begun; 0: never. A planner
     may doubt at each frame that something is still held, and at none enough. For ``termination=learned`` alone; it is 0 with
     others."""
+    repeat_discount: float = 0.5
+    """Where a primitive begins, the planner's probability of each counts by this share less for every time that it has begun in
+    the episode, six times at most; 0: not. So what did not help is not done for ever, where the planner is of two minds. For
+    ``termination=learned`` alone; it is 0 with others."""
     per_primitive: bool = True
     """One dynamics model per primitive (the paper's Multi), or one for all that is told the primitive. Fused linear maps are one
     for each in any case."""
@@ -207,7 +212,7 @@ class HDRILConfig(SingleFrameConfig):
         }
     )
 
-    running_options = frozenset({"samples", "rollout", "replan_every", "experts", "least_survival"})
+    running_options = frozenset({"samples", "rollout", "replan_every", "experts", "least_survival", "repeat_discount"})
     """What of a trained policy may change when it is run; everything else acts in training, or its weights have fixed it."""
 
     _given = frozenset[str]()
@@ -235,7 +240,7 @@ class HDRILConfig(SingleFrameConfig):
             if "plan_overlap" not in self._given:
                 self.plan_overlap = 0
         if self.termination != "learned":
-            for name in ("planner_balance", "planner_late", "least_survival"):
+            for name in ("planner_balance", "planner_late", "least_survival", "repeat_discount"):
                 if name not in self._given:
                     setattr(self, name, 0.0)
         if self.interaction != "object" and "planner_scale" not in self._given:
@@ -303,6 +308,11 @@ class HDRILConfig(SingleFrameConfig):
             raise ValueError(
                 "policy.least_survival must be from 0 to less than 1, and is for policy.termination=learned; "
                 f"got {self.least_survival} and {self.termination}"
+            )
+        if not 0.0 <= self.repeat_discount < 1.0 or (self.repeat_discount and self.termination != "learned"):
+            raise ValueError(
+                "policy.repeat_discount must be from 0 to less than 1, and is for policy.termination=learned; "
+                f"got {self.repeat_discount} and {self.termination}"
             )
         if not 0.0 <= self.planner_late <= 1.0 or (self.planner_late and self.termination != "learned"):
             raise ValueError(

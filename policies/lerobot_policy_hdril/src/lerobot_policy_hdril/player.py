@@ -11,6 +11,10 @@ from torch import Tensor
 
 from lerobot_policy_hdril.configuration_hdril import HDRILConfig
 
+MOST_DISCOUNTED = 6
+"""So many beginnings count against a primitive (``repeat_discount``). Where a task is done again and again in one episode, some
+primitives begin more often than others, as they should."""
+
 
 class Predictor(Protocol):
     """What playing asks of a policy."""
@@ -95,6 +99,7 @@ def advance(policy: Predictor, previous: PlaybackState | None, observed: Tensor)
     The planner is asked at every frame. From its shortest recorded length on, a primitive is over as soon as the planner
     prefers another, or, with ``termination=learned``, says that one begins; after its longest length it is over in any case.
     The same one may be next, unless the planner's doubts have added up (``least_survival``): then it is given up for another.
+    What begins is what the planner prefers, less for what has begun before (``repeat_discount``).
 
     A plan is made at the start of a primitive, and every ``replan_every`` frames; within a primitive, the last ``plan_overlap``
     frames of the plan before fade into it. In an open loop the state that was predicted for this frame takes the place of the
@@ -145,6 +150,8 @@ def _next_primitive(
     playing, elapsed = previous.primitive, previous.elapsed + 1
     wanted = best != playing if choice.go_on is None else highest > choice.go_on
     over = (elapsed >= policy.longest_length[playing]) | (wanted & (elapsed >= policy.shortest_length[playing]))
+    discount = (1.0 - policy.config.repeat_discount) ** previous.begun.clamp(max=MOST_DISCOUNTED)
+    best = (choice.begin * discount).argmax(-1)
     gave_up = torch.zeros_like(over)
     if policy.config.least_survival:
         gave_up = over & (best == playing) & (doubt.sum(-1) > -math.log(policy.config.least_survival))

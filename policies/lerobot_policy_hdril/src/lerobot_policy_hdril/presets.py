@@ -26,6 +26,7 @@ PLAIN: dict[str, Any] = {
     "planner_late": 0.0,
     "planner_scale": 0.0,
     "least_survival": 0.0,
+    "repeat_discount": 0.0,
     "replan_every": 0,
     "plan_overlap": 0,
 }
@@ -70,6 +71,7 @@ def _presets() -> dict[str, dict[str, Any]]:
         "planner_late": 0.5,
         "planner_scale": 0.05,
         "least_survival": 0.3,
+        "repeat_discount": 0.5,
         "replan_every": 2,
         "plan_overlap": 1,
         "decoder": "linear",
