@@ -20,8 +20,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from hdril.benchmark.steps import training_software
 from hdril.digest import digest_file
-from hdril.evaluation.software import evaluation_software, package_software, recording_software
+from hdril.evaluation.software import evaluation_software, recording_software
 
 CONFIG = Path("configs/train/table_lift.yaml")
 
@@ -96,7 +97,7 @@ def stages(output: Path, episodes: int, steps: int, evaluations: int) -> list[St
     """The pipeline. ``output`` is where everything goes."""
     dataset, train = output / "dataset", output / "train"
     policy = train / "checkpoints" / "last" / "pretrained_model"
-    learner = package_software("lerobot_policy_hdril")
+    learner = training_software("hdril")
     played = learner | evaluation_software("table_lift")
     return [
         Stage(

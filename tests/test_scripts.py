@@ -157,7 +157,7 @@ def test_records_say_what_a_result_is_made_from(run_demo: Demo) -> None:
     ("name", "again"),
     [
         ("recording_software", ["hdril-record"]),
-        ("package_software", ["lerobot-train 1", *EVALUATIONS]),
+        ("training_software", ["lerobot-train 1", *EVALUATIONS]),
         ("evaluation_software", EVALUATIONS),
     ],
 )

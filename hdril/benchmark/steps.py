@@ -181,7 +181,7 @@ class Train(Step):
         return given[-1] if given else values[name]
 
     def settings(self) -> dict[str, Any]:
-        software = _training_software(self.policy_type)
+        software = training_software(self.policy_type)
         return {
             "config": digest_file(self.config),
             "options": list(self.options),
@@ -225,8 +225,8 @@ def _in_memory_software() -> dict[str, str]:
     return {"source": digest_file(Path(package.origin).with_name("in_memory.py"))} | versions
 
 
-def _training_software(policy_type: str) -> dict[str, str]:
-    """What decides a training, the versions of the libraries and the sources of the policy."""
+def training_software(policy_type: str) -> dict[str, str]:
+    """What decides the training of a type of policies: the versions of the libraries, and the sources of the policy."""
     software = {name: distribution_version(name) for name in ("lerobot", "torch", "numpy")}
     if policy_type in ("hdril", "nearest"):
         return software | package_software("lerobot_policy_hdril")
@@ -309,7 +309,7 @@ class Evaluate(Step):
 
     def settings(self) -> dict[str, Any]:
         trials = {"task": self.task, "episodes": self.episodes, "first_seed": self.first_seed}
-        software = evaluation_software(base_name(self.task)) | _training_software(self.policy.policy_type)
+        software = evaluation_software(base_name(self.task)) | training_software(self.policy.policy_type)
         software |= {"hdril-eval": source_software(*_EVALUATED)["hdril"]}
         return trials | {"options": list(self.options), "software": software}
 

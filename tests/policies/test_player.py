@@ -24,14 +24,8 @@ class Scripted:
 
     def __init__(self, wishes: list[list[int]], **config) -> None:
         self.config = SimpleNamespace(
-            **{
-                "rollout": "closed_loop",
-                "replan_every": 0,
-                "plan_overlap": 0,
-                "least_survival": 0.0,
-                "repeat_discount": 0.0,
-            }
-            | {"filters": []}
+            **{"rollout": "closed_loop", "replan_every": 0, "plan_overlap": 0, "filters": []}
+            | {"least_survival": 0.0, "repeat_discount": 0.0}
             | config
         )
         self.shortest_length, self.longest_length = torch.tensor(SHORTEST), torch.tensor(LONGEST)

@@ -190,6 +190,9 @@ def test_what_has_begun_before_counts_for_less_where_a_primitive_begins(discount
 def test_what_has_begun_often_is_chosen_again_where_the_planner_is_sure() -> None:
     states = play(Torn([[0.01, 0.99, 0.0]], repeat_discount=0.5), 20)
     assert [int(s.primitive) for s in states] == [1] * 20
+    # After six beginnings its 0.98 count as 0.015, and no less after that.
+    states = play(Torn([[0.02, 0.98, 0.0]], repeat_discount=0.5), 20)
+    assert [int(s.primitive) for s in states] == [*[1] * 6, 0, *[1] * 13]
 
 
 def test_what_has_begun_before_does_not_keep_what_plays_from_going_on_or_another_from_beginning() -> None:
