@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -82,29 +83,40 @@ def test_a_form_has_a_model_and_is_no_other_primitive(gripping) -> None:
         assert explained.primitive in names
 
 
-def test_a_primitive_that_begins_again_in_another_form_was_tried_again(gripping) -> None:
+def test_forms_of_a_primitive_are_alike_and_told_as_one(gripping) -> None:
     policy = make(gripping)
+    forms = policy.config.form_names
+    assert policy.alike.tolist() == [[one == other for other in forms] for one in forms]
     policy.select_action(observation(gripping, [0]))
     playback = policy._playback
     assert isinstance(playback, PlaybackState)
+    assert playback.begun[0].tolist() == policy.alike[playback.primitive[0]].long().tolist()
+    again, given_up, passed_over = "grasp tried again", "grasp given up", "grasp passed over"
+    # By the form that begins, the one that was given up, and the one that was passed over.
     expected = {
-        (1, -1): ("grasp tried again",),
-        (2, -1): (),
-        (2, 0): ("grasp given up",),
-        (1, 0): ("grasp tried again",),
+        (1, -1, -1): (again,),
+        (2, -1, -1): (),
+        (2, 0, -1): (given_up,),
+        (1, 0, -1): (again,),
+        (2, -1, 1): (passed_over,),
+        (0, -1, 1): (again,),
+        (0, -1, 2): ("move passed over", again),
     }
-    for (form, gave_up), again in expected.items():
+    assert forms[:3] == ["grasp", "grasp", "move"]
+    for (form, gave_up, passed_over), events in expected.items():
+        told = {"primitive": form, "elapsed": 0, "gave_up": gave_up, "passed_over": passed_over}
         begun = torch.zeros_like(playback.begun)
-        begun[0, 0] = begun[0, form] = 1
-        begun[0, 0] += form == 0
-        policy._playback = PlaybackState(
-            **vars(playback)
-            | {"primitive": torch.tensor([form]), "elapsed": torch.tensor([0]), "begun": begun}
-            | {"gave_up": torch.tensor([gave_up])}
+        begun[0, :3] = torch.tensor([2, 2, 1])
+        policy._playback = replace(
+            playback, begun=begun, **{name: torch.tensor([value]) for name, value in told.items()}
         )
         explained = policy.explain()
         assert explained is not None
-        assert explained.events == again
+        assert explained.events == events
+    policy._playback = replace(policy._playback, elapsed=torch.tensor([1]), passed_over=torch.tensor([-1]))
+    explained = policy.explain()
+    assert explained is not None
+    assert explained.events == ()
 
 
 def test_a_checkpoint_keeps_its_forms_whatever_it_learns_from_next(gripping, metadata, tmp_path: Path) -> None:

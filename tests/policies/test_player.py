@@ -29,6 +29,7 @@ class Scripted:
             | config
         )
         self.shortest_length, self.longest_length = torch.tensor(SHORTEST), torch.tensor(LONGEST)
+        self.alike = torch.eye(3, dtype=torch.bool)
         self.wishes, self.planned_from, self.means = iter(wishes), [], []
 
     def choose(self, state, previous):

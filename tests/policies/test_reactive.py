@@ -188,11 +188,65 @@ def test_what_has_begun_before_counts_for_less_where_a_primitive_begins(discount
 
 
 def test_what_has_begun_often_is_chosen_again_where_the_planner_is_sure() -> None:
-    states = play(Torn([[0.01, 0.99, 0.0]], repeat_discount=0.5), 20)
+    states = play(Torn([[0.1, 0.9, 0.0]], repeat_discount=0.5), 20)
     assert [int(s.primitive) for s in states] == [1] * 20
-    # After six beginnings its 0.98 count as 0.015, and no less after that.
-    states = play(Torn([[0.02, 0.98, 0.0]], repeat_discount=0.5), 20)
-    assert [int(s.primitive) for s in states] == [*[1] * 6, 0, *[1] * 13]
+    # After three beginnings its 0.88 count as 0.11, and no less after that.
+    states = play(Torn([[0.12, 0.88, 0.0]], repeat_discount=0.5), 20)
+    assert [int(s.primitive) for s in states] == [*[1] * 3, 0, *[1] * 16]
+
+
+@pytest.mark.parametrize(("discount", "passed_over"), [(0.0, [-1] * 6), (0.5, [-1, 1, -1, 1, -1, 1])])
+def test_what_the_planner_preferred_and_what_did_not_begin_is_told(discount: float, passed_over: list[int]) -> None:
+    states = play(Torn([[0.35, 0.55, 0.1]], repeat_discount=discount), 6)
+    assert [int(s.passed_over) for s in states] == passed_over
+    assert all(int(s.gave_up) == -1 for s in states)
+
+
+def test_forms_of_a_primitive_begin_together() -> None:
+    policy = Torn([[0.5, 0.3, 0.2]], repeat_discount=0.5)
+    # The first two are forms of one primitive: when the first has begun, the second is as often begun.
+    policy.alike[0, 1] = policy.alike[1, 0] = True
+    states = play(policy, 4)
+    assert [int(s.primitive) for s in states] == [0, 0, 2, 0]
+    assert [s.begun.tolist() for s in states] == [[[1, 1, 0]], [[2, 2, 0]], [[2, 2, 1]], [[3, 3, 1]]]
+
+
+class Frames(Scripted):
+    """It says frame by frame how probable the beginning of each primitive is. What plays goes on with the rest."""
+
+    def __init__(self, says: list[list[float]], **config: Any) -> None:
+        super().__init__([], **config)
+        self.said = iter(says)
+        self.shortest_length, self.longest_length = torch.ones(3, dtype=torch.long), torch.full((3,), 4)
+
+    def choose(self, state, previous):
+        begin = torch.tensor([next(self.said)])
+        return Choice(begin, None if previous is None else 1.0 - begin.sum(-1), torch.zeros(1, 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("discount", "at_the_end", "begins", "gave_up", "passed_over"),
+    [
+        # The first primitive has begun twice and the second, which plays, once. Most doubts were that it is the first.
+        (0.0, [0.0, 1.0, 0.0], 0, 1, -1),
+        (0.5, [0.0, 1.0, 0.0], 2, 1, -1),
+        # What the planner prefers has begun too often, and what plays has failed: neither begins.
+        (0.0, [0.5, 0.3, 0.2], 0, -1, -1),
+        (0.5, [0.6, 0.35, 0.05], 2, -1, 0),
+        # What plays is no longer the first choice once it is discounted, so that doubts have nothing to say.
+        (0.0, [0.0, 0.6, 0.4], 2, 1, -1),
+        (0.5, [0.0, 0.6, 0.4], 2, -1, 1),
+    ],
+)
+def test_what_is_given_up_is_followed_by_what_has_begun_less_often(
+    discount: float, at_the_end: list[float], begins: int, gave_up: int, passed_over: int
+) -> None:
+    says = [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], *[[0.12, 0.0, 0.08]] * 3, at_the_end]
+    states = play(Frames(says, least_survival=0.6, repeat_discount=discount), len(says))
+    assert [int(s.primitive) for s in states] == [0, 0, 1, 1, 1, 1, begins]
+    assert states[-2].begun.tolist() == [[2, 1, 0]]
+    assert (int(states[-1].elapsed), int(states[-1].gave_up), int(states[-1].passed_over)) == (0, gave_up, passed_over)
+    assert all(int(s.gave_up) == int(s.passed_over) == -1 for s in states[:-1])
 
 
 def test_what_has_begun_before_does_not_keep_what_plays_from_going_on_or_another_from_beginning() -> None:

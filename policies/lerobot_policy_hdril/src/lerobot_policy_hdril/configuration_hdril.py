@@ -116,8 +116,8 @@ class HDRILConfig(SingleFrameConfig):
     others."""
     repeat_discount: float = 0.5
     """Where a primitive begins, the planner's probability of each counts by this share less for every time that it has begun in
-    the episode, six times at most; 0: not. So what did not help is not done for ever, where the planner is of two minds. For
-    ``termination=learned`` alone; it is 0 with others."""
+    the episode, in any of its forms, three times at most; 0: not. So what did not help is not done for ever, where the planner is
+    of two minds. For ``termination=learned`` alone; it is 0 with others."""
     per_primitive: bool = True
     """One dynamics model per primitive (the paper's Multi), or one for all that is told the primitive. Fused linear maps are one
     for each in any case."""

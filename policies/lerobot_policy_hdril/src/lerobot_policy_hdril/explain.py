@@ -86,10 +86,16 @@ def explain(policy: HDRILPolicy, playback: PlaybackState, row: int) -> Explanati
 
 
 def _events(names: list[str], playback: PlaybackState, row: int) -> tuple[str, ...]:
-    """A primitive that was given up, and one that begins for the second time or later."""
-    gave_up, playing = int(playback.gave_up[row]), int(playback.primitive[row])
+    """A primitive that was given up, one that was passed over, and one that begins for the second time or later."""
+    gave_up, passed_over, playing = (
+        int(told[row]) for told in (playback.gave_up, playback.passed_over, playback.primitive)
+    )
+    events = []
     # For another form of the same one: to everybody else that is the same primitive.
-    told = () if gave_up < 0 or names[gave_up] == names[playing] else (f"{names[gave_up]} given up",)
-    alike = torch.tensor([name == names[playing] for name in names])
-    again = int(playback.elapsed[row]) == 0 and int(playback.begun[row, alike].sum()) > 1
-    return (*told, f"{names[playing]} tried again") if again else told
+    if gave_up >= 0 and names[gave_up] != names[playing]:
+        events.append(f"{names[gave_up]} given up")
+    if passed_over >= 0 and names[passed_over] != names[playing]:
+        events.append(f"{names[passed_over]} passed over")
+    if int(playback.elapsed[row]) == 0 and int(playback.begun[row, playing]) > 1:
+        events.append(f"{names[playing]} tried again")
+    return tuple(events)

@@ -163,6 +163,8 @@ class HDRILPolicy(PreTrainedPolicy):
             self.register_buffer(key, torch.zeros(kinds, dtype=torch.long), persistent=False)
         if config.primitive_lengths:
             self.set_lengths(config.primitive_lengths)
+        primitive = torch.tensor([form[0] for form in config.forms])
+        self.register_buffer("alike", primitive[:, None] == primitive, persistent=False)
         self._quaternions = torch.tensor(quaternion_groups(config.action_names), dtype=torch.long)
         weights = torch.cat([torch.ones(action_dim), torch.full((state_dim,), config.state_loss_weight)])
         self.register_buffer("loss_weights", weights / weights.sum(), persistent=False)
@@ -173,6 +175,7 @@ class HDRILPolicy(PreTrainedPolicy):
     output_std: Tensor
     shortest_length: Tensor
     longest_length: Tensor
+    alike: Tensor
     loss_weights: Tensor
     feature_mean: Tensor
     feature_std: Tensor

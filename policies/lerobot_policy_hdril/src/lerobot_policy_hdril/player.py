@@ -11,9 +11,10 @@ from torch import Tensor
 
 from lerobot_policy_hdril.configuration_hdril import HDRILConfig
 
-MOST_DISCOUNTED = 6
-"""So many beginnings count against a primitive (``repeat_discount``). Where a task is done again and again in one episode, some
-primitives begin more often than others, as they should."""
+MOST_DISCOUNTED = 3
+"""So many beginnings count against a primitive (``repeat_discount``). With more, what the planner hardly finds possible would
+begin for once; and where a task is done again and again in one episode, some primitives begin more often than others, as they
+should."""
 
 
 class Predictor(Protocol):
@@ -22,6 +23,7 @@ class Predictor(Protocol):
     config: HDRILConfig
     shortest_length: Tensor  # (K,), frames
     longest_length: Tensor  # (K,), frames; 0 for a primitive that was never learned
+    alike: Tensor  # (K, K), bool: forms of one primitive
 
     def choose(self, state: Tensor, previous: PlaybackState | None) -> Choice:
         """What the planner says of states (B, S) that follow the frames of ``previous``."""
@@ -63,9 +65,10 @@ class PlaybackState:
     replanned: Tensor  # (B,), whether the plan was made at this frame
     probabilities: Tensor  # (B, K), the planner's at this frame
     recent: Tensor  # (B, n, S), the last states, no more than the filters need: observed, or predicted in an open loop
-    begun: Tensor  # (B, K), how often each primitive has begun
+    begun: Tensor  # (B, K), how often each primitive has begun, in any of its forms
     doubt: Tensor  # (B, K), hazard that each other primitive begins, added up since this one began for the first time in a row
     gave_up: Tensor  # (B,), the primitive that was given up at this frame; -1 where none was
+    passed_over: Tensor  # (B,), the one that the planner preferred, and that had begun too often; -1 where none was
     memory: Tensor  # (1, B, H), the planner's
 
     @property
@@ -98,8 +101,9 @@ def advance(policy: Predictor, previous: PlaybackState | None, observed: Tensor)
 
     The planner is asked at every frame. From its shortest recorded length on, a primitive is over as soon as the planner
     prefers another, or, with ``termination=learned``, says that one begins; after its longest length it is over in any case.
-    The same one may be next, unless the planner's doubts have added up (``least_survival``): then it is given up for another.
-    What begins is what the planner prefers, less for what has begun before (``repeat_discount``).
+    What begins is what the planner prefers, less for what has begun before, in any of its forms (``repeat_discount``). It may be
+    the same one again, unless the planner's doubts have added up (``least_survival``): then what was doubted most begins in its
+    place, less for what has begun before, too.
 
     A plan is made at the start of a primitive, and every ``replan_every`` frames; within a primitive, the last ``plan_overlap``
     frames of the plan before fade into it. In an open loop the state that was predicted for this frame takes the place of the
@@ -114,7 +118,7 @@ def advance(policy: Predictor, previous: PlaybackState | None, observed: Tensor)
     doubt = torch.zeros_like(choice.begin, dtype=torch.float32)
     if previous is not None and policy.config.least_survival:
         doubt = _doubt(previous, choice)
-    primitive, elapsed, gave_up = _next_primitive(policy, previous, choice, doubt)
+    primitive, elapsed, gave_up, passed_over = _next_primitive(policy, previous, choice, doubt)
     if previous is not None:
         doubt = torch.where((primitive == previous.primitive)[:, None], doubt, 0.0)
     probabilities = choice.begin if previous is None else choice.probabilities(previous.primitive)
@@ -122,13 +126,24 @@ def advance(policy: Predictor, previous: PlaybackState | None, observed: Tensor)
     if previous is not None:
         recent = torch.cat([previous.recent, recent], dim=1)[:, -max(policy.config.filters, default=1) :]
     begun = torch.zeros_like(choice.begin, dtype=torch.long) if previous is None else previous.begun
-    begun = begun.scatter_add(1, primitive[:, None], (elapsed == 0).long()[:, None])
+    begun = begun + (policy.alike[primitive] & (elapsed == 0)[:, None])
     replanned = elapsed == 0
     if policy.config.replan_every:
         replanned = elapsed % policy.config.replan_every == 0
     plan, plan_start = _next_plan(policy, previous, recent, primitive, elapsed, replanned)
     return PlaybackState(
-        primitive, elapsed, plan, plan_start, replanned, probabilities, recent, begun, doubt, gave_up, choice.memory
+        primitive=primitive,
+        elapsed=elapsed,
+        plan=plan,
+        plan_start=plan_start,
+        replanned=replanned,
+        probabilities=probabilities,
+        recent=recent,
+        begun=begun,
+        doubt=doubt,
+        gave_up=gave_up,
+        passed_over=passed_over,
+        memory=choice.memory,
     )
 
 
@@ -142,21 +157,30 @@ def _doubt(previous: PlaybackState, choice: Choice) -> Tensor:
 
 def _next_primitive(
     policy: Predictor, previous: PlaybackState | None, choice: Choice, doubt: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Primitives (B,) of this frame, how many of their frames are over, and those that were given up, -1 where none was."""
-    highest, best = choice.begin.max(-1)
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Primitives (B,) of this frame, and how many of their frames are over; those that were given up and those that were passed
+    over, -1 where none was."""
+    highest, preferred = choice.begin.max(-1)
+    nothing = torch.full_like(preferred, -1)
     if previous is None:
-        return best, torch.zeros_like(best), torch.full_like(best, -1)
+        return preferred, torch.zeros_like(preferred), nothing, nothing
     playing, elapsed = previous.primitive, previous.elapsed + 1
-    wanted = best != playing if choice.go_on is None else highest > choice.go_on
+    wanted = preferred != playing if choice.go_on is None else highest > choice.go_on
     over = (elapsed >= policy.longest_length[playing]) | (wanted & (elapsed >= policy.shortest_length[playing]))
     discount = (1.0 - policy.config.repeat_discount) ** previous.begun.clamp(max=MOST_DISCOUNTED)
     best = (choice.begin * discount).argmax(-1)
     gave_up = torch.zeros_like(over)
     if policy.config.least_survival:
-        gave_up = over & (best == playing) & (doubt.sum(-1) > -math.log(policy.config.least_survival))
-        best = torch.where(gave_up, doubt.argmax(-1), best)
-    return torch.where(over, best, playing), torch.where(over, 0, elapsed), torch.where(gave_up, playing, -1)
+        doubted = over & (best == playing) & (doubt.sum(-1) > -math.log(policy.config.least_survival))
+        best = torch.where(doubted, (doubt * discount).argmax(-1), best)
+        gave_up = doubted & (preferred == playing)
+    passed_over = over & (best != preferred) & ~gave_up
+    return (
+        torch.where(over, best, playing),
+        torch.where(over, 0, elapsed),
+        torch.where(gave_up, playing, nothing),
+        torch.where(passed_over, preferred, nothing),
+    )
 
 
 def _next_plan(
