@@ -14,7 +14,7 @@ BESIDE = {
     "dtw_cm": "DTW, cm",
     "pc_expert_choice": "first primitive the expert's, %",
     "jerk_to_expert": "jerk, times the expert's",
-    "pc_noticed": "says that it tried again or gave up, %",
+    "pc_noticed": "says that it tried again, gave up or passed over, %",
     "pc_success_noticed": "success where it did, %",
 }
 """What may stand beside success, by its name in ``results.json``, and what the column is called."""
@@ -97,8 +97,8 @@ class TableSpec:
     beside: list[str] = field(default_factory=list)
     """What is shown beside success: errors against the expert (position_error_cm, angle_error_rad, dtw_cm), how often the policy
     begins with the expert's primitive (pc_expert_choice), its hands' jerk against the expert's (jerk_to_expert), in how many
-    episodes it says that it tried again or gave up (pc_noticed), and how many of these succeed (pc_success_noticed). A policy
-    without primitives says nothing."""
+    episodes it says that it tried again, gave something up or passed something over (pc_noticed), and how many of these succeed
+    (pc_success_noticed). A policy without primitives says nothing."""
     by_primitive: bool = False
     """Whether the mean distance of the hands from the noise-free expert's has a table of its own, by the expert's primitive."""
     phases: dict[str, list[str]] = field(default_factory=dict)

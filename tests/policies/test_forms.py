@@ -87,6 +87,8 @@ def test_forms_of_a_primitive_are_alike_and_told_as_one(gripping) -> None:
     policy = make(gripping)
     forms = policy.config.form_names
     assert policy.alike.tolist() == [[one == other for other in forms] for one in forms]
+    assert "alike" in dict(policy.named_buffers()), "it moves to the device with the weights"
+    assert "alike" not in policy.state_dict(), "checkpoints of before have none"
     policy.select_action(observation(gripping, [0]))
     playback = policy._playback
     assert isinstance(playback, PlaybackState)
@@ -117,6 +119,24 @@ def test_forms_of_a_primitive_are_alike_and_told_as_one(gripping) -> None:
     explained = policy.explain()
     assert explained is not None
     assert explained.events == ()
+
+
+def test_each_episode_of_a_batch_tells_its_own_events(gripping) -> None:
+    policy = make(gripping)
+    policy.select_action(observation(gripping, [0, 1]))
+    playback = policy._playback
+    assert isinstance(playback, PlaybackState)
+    begun = torch.zeros_like(playback.begun)
+    begun[0] = 1
+    begun[1] = 2
+    told = {"primitive": [0, 2], "gave_up": [2, -1], "passed_over": [-1, 0], "elapsed": [0, 0]}
+    policy._playback = replace(playback, begun=begun, **{name: torch.tensor(value) for name, value in told.items()})
+    explained = [policy.explain(row) for row in range(2)]
+    assert all(explained)
+    assert [one.events for one in explained if one] == [
+        ("move given up",),
+        ("grasp passed over", "move tried again"),
+    ]
 
 
 def test_a_checkpoint_keeps_its_forms_whatever_it_learns_from_next(gripping, metadata, tmp_path: Path) -> None:

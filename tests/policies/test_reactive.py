@@ -212,16 +212,16 @@ def test_forms_of_a_primitive_begin_together() -> None:
 
 
 class Frames(Scripted):
-    """It says frame by frame how probable the beginning of each primitive is. What plays goes on with the rest."""
+    """It says frame by frame how probable it is in each episode that a primitive begins. What plays goes on with the rest."""
 
-    def __init__(self, says: list[list[float]], **config: Any) -> None:
+    def __init__(self, says: list[list[list[float]]], **config: Any) -> None:
         super().__init__([], **config)
         self.said = iter(says)
         self.shortest_length, self.longest_length = torch.ones(3, dtype=torch.long), torch.full((3,), 4)
 
     def choose(self, state, previous):
-        begin = torch.tensor([next(self.said)])
-        return Choice(begin, None if previous is None else 1.0 - begin.sum(-1), torch.zeros(1, 1, 1))
+        begin = torch.tensor(next(self.said))
+        return Choice(begin, None if previous is None else 1.0 - begin.sum(-1), torch.zeros(1, len(begin), 1))
 
 
 @pytest.mark.parametrize(
@@ -241,12 +241,30 @@ class Frames(Scripted):
 def test_what_is_given_up_is_followed_by_what_has_begun_less_often(
     discount: float, at_the_end: list[float], begins: int, gave_up: int, passed_over: int
 ) -> None:
-    says = [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], *[[0.12, 0.0, 0.08]] * 3, at_the_end]
+    says = [[[1.0, 0.0, 0.0]]] * 2 + [[[0.0, 1.0, 0.0]]] + [[[0.12, 0.0, 0.08]]] * 3 + [[at_the_end]]
     states = play(Frames(says, least_survival=0.6, repeat_discount=discount), len(says))
     assert [int(s.primitive) for s in states] == [0, 0, 1, 1, 1, 1, begins]
     assert states[-2].begun.tolist() == [[2, 1, 0]]
     assert (int(states[-1].elapsed), int(states[-1].gave_up), int(states[-1].passed_over)) == (0, gave_up, passed_over)
     assert all(int(s.gave_up) == int(s.passed_over) == -1 for s in states[:-1])
+
+
+def test_what_is_passed_over_or_given_up_in_one_episode_of_a_batch_is_not_in_another() -> None:
+    states = play(Torn([[0.35, 0.55, 0.1], [0.1, 0.9, 0.0]], repeat_discount=0.5), 4, 2)
+    assert [s.passed_over.tolist() for s in states] == [[-1, -1], [1, -1], [-1, -1], [1, -1]]
+
+    begins = [[[1.0, 0.0, 0.0]] * 2] * 2 + [[[0.0, 1.0, 0.0]] * 2] + [[[0.12, 0.0, 0.08]] * 2] * 3
+    policy = Frames([*begins, [[0.0, 1.0, 0.0], [0.6, 0.35, 0.05]]], least_survival=0.6, repeat_discount=0.5)
+    last = play(policy, 7, 2)[-1]
+    assert (last.primitive.tolist(), last.gave_up.tolist(), last.passed_over.tolist()) == ([2, 2], [1, -1], [-1, 0])
+
+
+def test_three_beginnings_count_at_most_against_what_most_doubts_speak_for() -> None:
+    # A tenth as many doubts speak for the third one, which has never begun: it would be next if a fourth beginning counted.
+    says = [[[1.0, 0.0, 0.0]]] * 4 + [[[0.0, 1.0, 0.0]]] + [[[0.1, 0.0, 0.01]]] * 3 + [[[0.0, 1.0, 0.0]]]
+    states = play(Frames(says, least_survival=0.9, repeat_discount=0.5), len(says))
+    assert states[-2].begun.tolist() == [[4, 1, 0]]
+    assert (int(states[-1].primitive), int(states[-1].gave_up)) == (0, 1)
 
 
 def test_what_has_begun_before_does_not_keep_what_plays_from_going_on_or_another_from_beginning() -> None:
