@@ -17,10 +17,11 @@ MARKERS = "osD^v<>P"
 
 
 def figures(table: Mapping[str, Any]) -> dict[str, Figure]:
-    """The figures of a table of ``benchmark.json``, by what they show: ``success``; ``demonstrations`` and ``minutes``, where
-    there are rows of more than one number of demonstrations, or of more than one budget of training; ``trajectories`` of
-    demonstrations, a held-out ``episode`` and the ``attention`` at its beginning, where the table has them."""
-    found = {"success": _success(table)}
+    """The figures of a table of ``benchmark.json``, by what they show: ``success``, where there are rows to compare;
+    ``demonstrations`` and ``minutes``, where there are rows of more than one number of demonstrations, or of more than one budget
+    of training; ``trajectories`` of demonstrations, a held-out ``episode`` and the ``attention`` at its beginning, where the
+    table has them."""
+    found = {"success": _success(table)} if len(table["rows"]) > 1 else {}
     if len({row["demonstrations"] for row in table["rows"]}) > 1:
         found["demonstrations"] = _curves(table, "demonstrations", "demonstrations", _counts)
     if len({row["minutes"] for row in table["rows"]} - {None}) > 1:

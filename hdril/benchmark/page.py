@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from hdril.benchmark.figures import figures
 from hdril.benchmark.report import markdown
+from hdril.benchmark.results import runs_of
+from hdril.evaluation.checkpoint import read_json
 from hdril.files import write_atomically
 
 if TYPE_CHECKING:
@@ -23,12 +25,17 @@ _STYLE = (
     "td,th{border:1px solid #c8d2dc;padding:.25rem .6rem;text-align:left}th{background:#eef3f8}"
     "pre{background:#f4f6f8;padding:.8rem;overflow-x:auto;font-size:12px}svg{max-width:100%;height:auto}"
 )
+_COLOURS = 64
+"""Of a PNG. A few lines and letters need no more, and it has a third of the bytes."""
+_DIGITS = 6
+"""Significant digits of a number in the JSON."""
 
 
 def write_report(document: Path, results: Mapping[str, Any], gone: Iterable[str] = ()) -> list[Path]:
     """Write ``<document>.json``, ``.md`` and ``.html``, and each figure as ``<document>_<table>_<name>.png`` and ``.svg``.
 
-    The page holds everything that it shows. Figures of tables that are ``gone``, by title, are removed. Returns the files.
+    The page holds everything that it shows. Older figures of these tables and of those that are ``gone``, by title, are removed.
+    Returns the files.
     """
 
     def beside(suffix: str) -> Path:
@@ -47,7 +54,7 @@ def write_report(document: Path, results: Mapping[str, Any], gone: Iterable[str]
     files[beside(".html")] = _page(files[beside(".md")].decode(), pictures).encode()
     for path, data in files.items():
         write_atomically(path, lambda file, data=data: file.write(data))
-    for title in gone:
+    for title in (*gone, *(table["title"] for table in results["tables"])):
         for kind in ("png", "svg"):
             for path in set(document.parent.glob(f"{document.name}_{slug(title)}_*.{kind}")) - files.keys():
                 path.unlink()
@@ -64,12 +71,52 @@ def write_numbers(document: Path, results: Mapping[str, Any]) -> None:
     write_atomically(numbers_file(document), lambda file: file.write(_one_a_line(results).encode()))
 
 
+def read_numbers(document: Path) -> dict[str, Any]:
+    """Results as they were written, numbers to six significant digits.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is damaged.
+    """
+    results = read_json(numbers_file(document))
+    known = {_name_of(step): step for step in results.pop("steps", [])}
+    for run in runs_of(results):
+        # Older reports have the whole in each run, and the oldest nothing.
+        made_from = run.get("made_from", {})
+        made_from |= {kind: known[name] for kind, name in made_from.items() if isinstance(name, str)}
+    return results
+
+
 def _one_a_line(results: Mapping[str, Any]) -> str:
-    """JSON that is small, and of which a change of one table, or of one run of an unfinished one, changes one line."""
-    lists = {key: ",\n".join(map(json.dumps, results.get(key, []))) for key in ("tables", "runs")}
-    rest = json.dumps({key: value for key, value in results.items() if key not in lists})
-    told = "".join(f', "{key}": [\n{lines}\n]' if lines else f', "{key}": []' for key, lines in lists.items())
-    return f"{rest[:-1]}{told}}}"
+    """JSON that is small, and of which a change of one table, or of one run of an unfinished one, changes few lines.
+
+    Recordings and trainings, from which many runs were made, are listed once, in ``steps``.
+    """
+    dump = json.JSONEncoder(separators=(",", ":")).encode
+    told = _short(results)
+    known: dict[str, Any] = {}
+    for run in runs_of(told):
+        made_from = run.get("made_from", {})
+        known |= {_name_of(step): step for step in made_from.values()}
+        made_from |= {kind: _name_of(step) for kind, step in made_from.items()}
+    told["steps"] = [known[name] for name in sorted(known)]
+    lists = {key: ",\n".join(map(dump, told.pop(key, []))) for key in ("tables", "runs", "steps")}
+    lines = "".join(f',"{key}":[\n{each}\n]' if each else f',"{key}":[]' for key, each in lists.items())
+    return f"{dump(told)[:-1]}{lines}}}"
+
+
+def _name_of(step: Mapping[str, Any]) -> str:
+    """Of a recording or a training: the same recipe may give another result on another machine."""
+    return f"{step['recipe']} {step['digest']}"
+
+
+def _short(value: Any) -> Any:
+    """A copy whose numbers have few digits."""
+    if isinstance(value, Mapping):
+        return {key: _short(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_short(each) for each in value]
+    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value
 
 
 def slug(title: str) -> str:
@@ -83,9 +130,24 @@ def _picture(figure: Figure, kind: str) -> bytes:
 
     buffer = io.BytesIO()
     # Letters stay text: as outlines they are most of a page's bytes, and cannot be searched or read aloud.
-    with matplotlib.rc_context({"svg.hashsalt": "hdril", "svg.fonttype": "none"}):
+    fonts = {"svg.hashsalt": "hdril", "svg.fonttype": "none", "font.sans-serif": ["DejaVu Sans", "sans-serif"]}
+    with matplotlib.rc_context(fonts):
         figure.savefig(buffer, format=kind, dpi=110, metadata={"Date": None} if kind == "svg" else {"Software": None})
+    return _few_colours(buffer) if kind == "png" else _few_digits(buffer.getvalue().decode()).encode()
+
+
+def _few_colours(picture: io.BytesIO) -> bytes:
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    image = Image.open(picture).convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE)
+    image.save(buffer, format="png", optimize=True)
     return buffer.getvalue()
+
+
+def _few_digits(picture: str) -> str:
+    """An SVG without indents, and with hundredths of a point."""
+    return re.sub(r"\n\s+", "\n", re.sub(r"(\d\.\d\d)\d+", r"\1", picture))
 
 
 def _page(text: str, pictures: Mapping[str, str]) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import asdict, replace
 from itertools import product
 from typing import Any
@@ -74,10 +74,15 @@ def blank(matrix: Matrix) -> dict[str, Any]:
 
 def kept_runs(report: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """What a report has of steps that need not be done again. Older reports do not say how their numbers were made."""
-    tables = report.get("tables", [])
-    found = [run for table in tables for row in table.get("rows", []) for runs in row["cells"].values() for run in runs]
-    found += [episode for table in tables for episode in table.get("episodes", {}).values()]
-    return {run["recipe"]: run for run in (*report.get("runs", []), *found) if run.get("shape") == _RUN_SHAPE}
+    return {run["recipe"]: run for run in runs_of(report) if run.get("shape") == _RUN_SHAPE}
+
+
+def runs_of(report: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Evaluations and drawn episodes of a report: of no table yet, and of its tables."""
+    yield from report.get("runs", [])
+    for table in report.get("tables", []):
+        yield from (run for row in table.get("rows", []) for runs in row["cells"].values() for run in runs)
+        yield from table.get("episodes", {}).values()
 
 
 def usable(matrix: Matrix, table: TableSpec, store: Store, kept: Kept) -> dict[str, Mapping[str, Any]]:

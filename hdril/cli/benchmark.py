@@ -17,7 +17,7 @@ from tqdm import tqdm
 from hdril.benchmark.check import check
 from hdril.benchmark.engine import Engine, Progress, in_order
 from hdril.benchmark.matrix import Matrix, all_steps
-from hdril.benchmark.page import numbers_file, write_numbers, write_report
+from hdril.benchmark.page import numbers_file, read_numbers, write_numbers, write_report
 from hdril.benchmark.perform import is_running
 from hdril.benchmark.results import Kept, blank, collect, keep_tables, kept_runs, run_of, torn, unfinished, usable
 from hdril.benchmark.steps import Evaluate, Play, Step
@@ -25,7 +25,6 @@ from hdril.benchmark.store import Store
 from hdril.cli.common import run
 from hdril.cli.shards import log_folder
 from hdril.errors import UserError
-from hdril.evaluation.checkpoint import read_json
 from hdril.execution import SlurmConfig, check_execution, submit_to_slurm
 from hdril.files import LOCK, is_busy
 
@@ -144,7 +143,7 @@ def _keep(config: BenchmarkConfig, store: Store, step: Step) -> None:
     if isinstance(step, Evaluate | Play):
         with _alone(config):
             before, run = _report_before(config) or blank(config), run_of(step, store)
-            if kept_runs(before).get(run["recipe"]) != run:
+            if kept_runs(before).get(run["recipe"], {}).get("digest") != run["digest"]:
                 runs = {each["recipe"]: each for each in (*before.get("runs", []), run)}
                 write_numbers(_document(config), {**before, "runs": list(runs.values())})
 
@@ -164,7 +163,7 @@ def _report_before(config: BenchmarkConfig) -> Mapping[str, Any]:
     path = numbers_file(_document(config))
     if not path.exists():
         return {}
-    found = read_json(path)
+    found = read_numbers(_document(config))
     ours = {"name": config.name, "tuning": config.tuning}
     if other := {key: found.get(key) for key, value in ours.items() if found.get(key) != value}:
         raise ValueError(f"{path} is the report of another benchmark: {other}; give another --document")

@@ -16,6 +16,7 @@ import draccus
 import numpy as np
 import pytest
 from lerobot.configs.train import TrainPipelineConfig
+from PIL import Image
 
 from hdril.benchmark import results
 from hdril.benchmark import steps as steps_module
@@ -24,7 +25,7 @@ from hdril.benchmark.check import check, check_held_out
 from hdril.benchmark.engine import in_order
 from hdril.benchmark.figures import figures
 from hdril.benchmark.matrix import Matrix, all_steps, drawn_data, rows, steps
-from hdril.benchmark.page import write_report
+from hdril.benchmark.page import read_numbers, write_report
 from hdril.benchmark.perform import Assignment
 from hdril.benchmark.report import markdown
 from hdril.benchmark.results import collect
@@ -1366,8 +1367,13 @@ def test_the_page_holds_all_that_it_shows(tmp_path: Path) -> None:
     assert names == {"test.json", "test.md", "test.html"} | pictures
     assert names == {path.name for path in (tmp_path / "out").iterdir()}
     page, text, data = ((tmp_path / f"out/test.{kind}").read_text() for kind in ("html", "md", "json"))
-    assert json.loads(data) == json.loads(json.dumps(results))
-    assert len(data.splitlines()) == 3, "one table a line"
+    assert read_numbers(tmp_path / "out/test") == approximately(json.loads(json.dumps(results)))
+    table, *rest = json.loads(data)["tables"]
+    assert (len(data.splitlines()), rest) == (4 + len(json.loads(data)["steps"]), []), "one table and one step a line"
+    made_from = [run["made_from"] for row in table["rows"] for runs in row["cells"].values() for run in runs]
+    told = [f"{step['recipe']} {step['digest']}" for step in json.loads(data)["steps"]]
+    assert {name for made in made_from for name in made.values()} == set(told)
+    assert len(told) == len(set(told)), "each step is listed once"
     write_report(tmp_path / "none/test", results | {"tables": []})
     assert json.loads((tmp_path / "none/test.json").read_text())["tables"] == []
     assert "![Lift](test_lift_success.png)" in text
@@ -1375,6 +1381,11 @@ def test_the_page_holds_all_that_it_shows(tmp_path: Path) -> None:
     assert "<img" not in page
     assert re.search(r"<text[^>]*>success, %</text>", page), "letters in pictures are text"
     assert "<table>" in page
+    for name in pictures:
+        if name.endswith("png"):
+            assert Image.open(tmp_path / "out" / name).mode == "P", "few colours, few bytes"
+        else:
+            assert not re.search(r"\n\s|\d\.\d{3}", (tmp_path / "out" / name).read_text()), "few digits, no indents"
     parts = re.findall(r' id="([^"]+)"', page)
     assert len(parts) == len(set(parts)), "names of parts are unique"
     assert set(re.findall(r'(?:xlink:href="|url\()#([^")]+)', page)) <= set(parts)
@@ -1382,6 +1393,49 @@ def test_the_page_holds_all_that_it_shows(tmp_path: Path) -> None:
     before = {path.name: path.read_bytes() for path in files}
     write_report(tmp_path / "out/test", results)
     assert {path.name: path.read_bytes() for path in files} == before, "the same numbers make the same files"
+    write_report(tmp_path / "out/test", read_numbers(tmp_path / "out/test"))
+    assert {path.name: path.read_bytes() for path in files} == before, "what was read again makes the same files"
+
+
+def approximately(value: Any) -> Any:
+    """With numbers that are equal to six digits."""
+    if isinstance(value, dict):
+        return {key: approximately(each) for key, each in value.items()}
+    if isinstance(value, list):
+        return [approximately(each) for each in value]
+    return pytest.approx(value, rel=1e-5) if isinstance(value, float) else value
+
+
+def test_a_table_of_one_row_has_no_figure_of_its_success(tmp_path: Path) -> None:
+    def reported(name: str, change: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
+        matrix, store = changed(change), Store(tmp_path / name)
+        pretend(store, matrix, fails)
+        return collect(matrix, store)
+
+    def single(values: dict[str, Any]) -> None:
+        one_row(values)
+        values["tables"][0].update(policies=["linear"], against="")
+
+    other = tmp_path / "test_lifting_success.png"
+    other.write_bytes(b"of a table with a longer title")
+    for found, drawn in ((reported("several", one_row), True), (reported("one", single), False)):
+        write_report(tmp_path / "test", found)
+        assert (tmp_path / "test_lift_success.png").exists() == drawn, "an older figure is removed"
+        assert ("![Lift](test_lift_success.png)" in (tmp_path / "test.md").read_text()) == drawn
+    assert other.exists()
+
+
+def test_reports_that_hold_each_step_in_each_run_are_read(tmp_path: Path) -> None:
+    matrix, store = changed(one_row), Store(tmp_path / "store")
+    pretend(store, matrix, fails)
+    results = collect(matrix, store)
+    (tmp_path / "test.json").write_text(json.dumps(results))
+    assert read_numbers(tmp_path / "test") == json.loads(json.dumps(results))
+    for runs in results["tables"][0]["rows"][0]["cells"].values():
+        for run in runs:
+            del run["made_from"]
+    (tmp_path / "test.json").write_text(json.dumps(results))
+    assert read_numbers(tmp_path / "test") == json.loads(json.dumps(results))
 
 
 def test_the_command_plans_and_reports_without_doing_what_is_done(
@@ -1440,7 +1494,7 @@ def do(folder: Path, title: str, store: str, change: Callable[[dict[str, Any]], 
     if not part.store.exists():
         pretend(Store(part.store), part.chosen, fails)
     benchmark_command(part)
-    return json.loads((folder / "report.json").read_text())
+    return read_numbers(folder / "report")
 
 
 def titles(report: dict[str, Any]) -> list[str]:
@@ -1528,7 +1582,7 @@ def session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., di
             assert "a step failed" in str(error)  # noqa: PT017
         finally:
             shutil.rmtree(config.store, ignore_errors=True)
-        return json.loads((tmp_path / f"{document}.json").read_text())
+        return read_numbers(tmp_path / document)
 
     return run
 
@@ -1638,7 +1692,7 @@ def test_a_table_that_goes_takes_its_pictures_along(tmp_path: Path) -> None:
 def test_the_tables_of_the_published_pages_are_what_the_matrix_asks_for(page: Path) -> None:
     """A change of the definition, or of what a report needs, would drop rows that took hours."""
     matrix = read(ROOT / f"configs/benchmark/{page.stem}.yaml")
-    before = json.loads(page.read_text())
+    before = read_numbers(page.with_suffix(""))
     results.kept_runs(before)  # older ones do not say how they were made
     kept = results.keep_tables(matrix, before | {"tables": []}, before)
     assert [table["title"] for table in kept["tables"]] == [table["title"] for table in before["tables"]]
