@@ -130,8 +130,9 @@ def _picture(figure: Figure, kind: str) -> bytes:
 
     buffer = io.BytesIO()
     # Letters stay text: as outlines they are most of a page's bytes, and cannot be searched or read aloud.
-    fonts = {"svg.hashsalt": "hdril", "svg.fonttype": "none", "font.sans-serif": ["DejaVu Sans", "sans-serif"]}
-    with matplotlib.rc_context(fonts):
+    with matplotlib.rc_context(
+        {"svg.hashsalt": "hdril", "svg.fonttype": "none", "font.sans-serif": ["DejaVu Sans", "sans-serif"]}
+    ):
         figure.savefig(buffer, format=kind, dpi=110, metadata={"Date": None} if kind == "svg" else {"Software": None})
     return _few_colours(buffer) if kind == "png" else _few_digits(buffer.getvalue().decode()).encode()
 
