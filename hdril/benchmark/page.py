@@ -147,8 +147,9 @@ def _few_colours(picture: io.BytesIO) -> bytes:
 
 
 def _few_digits(picture: str) -> str:
-    """An SVG without indents, and with hundredths of a point."""
-    return re.sub(r"\n\s+", "\n", re.sub(r"(\d\.\d\d)\d+", r"\1", picture))
+    """An SVG without indents, and with hundredths of a point. Words keep their digits: they are outside of tags."""
+    tags = re.sub(r"<[^>]*>", lambda tag: re.sub(r"(\d\.\d\d)\d+", r"\1", tag[0]), picture)
+    return re.sub(r"\n\s+", "\n", tags)
 
 
 def _page(text: str, pictures: Mapping[str, str]) -> str:

@@ -1385,7 +1385,8 @@ def test_the_page_holds_all_that_it_shows(tmp_path: Path) -> None:
         if name.endswith("png"):
             assert Image.open(tmp_path / "out" / name).mode == "P", "few colours, few bytes"
         else:
-            assert not re.search(r"\n\s|\d\.\d{3}", (tmp_path / "out" / name).read_text()), "few digits, no indents"
+            drawn = (tmp_path / "out" / name).read_text()
+            assert not re.search(r"\n\s|\d\.\d{3}[^<]*>", drawn), "few digits, no indents"
     parts = re.findall(r' id="([^"]+)"', page)
     assert len(parts) == len(set(parts)), "names of parts are unique"
     assert set(re.findall(r'(?:xlink:href="|url\()#([^")]+)', page)) <= set(parts)
@@ -1404,6 +1405,16 @@ def approximately(value: Any) -> Any:
     if isinstance(value, list):
         return [approximately(each) for each in value]
     return pytest.approx(value, rel=1e-5) if isinstance(value, float) else value
+
+
+def test_words_in_a_figure_keep_their_digits(tmp_path: Path) -> None:
+    matrix, store = changed(one_row), Store(tmp_path / "store")
+    pretend(store, matrix, fails)
+    found = collect(matrix, store)
+    found["tables"][0]["title"] = "Seen with 0.00525 m"
+    write_report(tmp_path / "test", found)
+    (picture,) = tmp_path.glob("*_success.svg")
+    assert ">Seen with 0.00525 m</text>" in picture.read_text()
 
 
 def test_a_table_of_one_row_has_no_figure_of_its_success(tmp_path: Path) -> None:
