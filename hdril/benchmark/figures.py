@@ -15,6 +15,9 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 MARKERS = "osD^v<>P"
 """A shape for each colour: no figure needs colour to be read."""
 
+FIGURES = ("success", "demonstrations", "minutes", "trajectories", "episode", "attention")
+"""Names of all that a table may have."""
+
 
 def figures(table: Mapping[str, Any]) -> dict[str, Figure]:
     """The figures of a table of ``benchmark.json``, by what they show: ``success``, where there are rows to compare;
@@ -135,7 +138,7 @@ def _success(table: Mapping[str, Any]) -> Figure:
             y = place + (number - (len(names) - 1) / 2) * 0.8 / len(names)
             _mark(axes, row["cells"][name], y, number, name if place == 0 else None)
     axes.set_yticks(range(len(rows)), labels)
-    # The first row on top, and room beside the outermost marks, also where there is one row.
+    # The first row on top, and room beside the outermost marks.
     axes.set(xlim=(-2, 102), ylim=(len(rows) - 0.5, -0.5), xlabel="success, %", title=table["title"])
     axes.grid(axis="x", alpha=0.3)
     axes.legend(loc="lower left", bbox_to_anchor=(1.0, 0.0), frameon=False)

@@ -7,12 +7,14 @@ import io
 import json
 import re
 from collections.abc import Iterable, Mapping
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hdril.benchmark.figures import figures
+from hdril.benchmark.figures import FIGURES, figures
 from hdril.benchmark.report import markdown
 from hdril.benchmark.results import runs_of
+from hdril.digest import SHORT, digest_json
 from hdril.evaluation.checkpoint import read_json
 from hdril.files import write_atomically
 
@@ -41,6 +43,7 @@ def write_report(document: Path, results: Mapping[str, Any], gone: Iterable[str]
     def beside(suffix: str) -> Path:
         return document.with_name(document.name + suffix)
 
+    results = _short(results)  # what is read again makes the same page
     drawn = [figures(table) for table in results["tables"]]
     files: dict[Path, bytes] = {numbers_file(document): _one_a_line(results).encode()}
     names = []
@@ -54,10 +57,12 @@ def write_report(document: Path, results: Mapping[str, Any], gone: Iterable[str]
     files[beside(".html")] = _page(files[beside(".md")].decode(), pictures).encode()
     for path, data in files.items():
         write_atomically(path, lambda file, data=data: file.write(data))
-    for title in (*gone, *(table["title"] for table in results["tables"])):
-        for kind in ("png", "svg"):
-            for path in set(document.parent.glob(f"{document.name}_{slug(title)}_*.{kind}")) - files.keys():
-                path.unlink()
+    for title, name, kind in product(
+        (*gone, *(table["title"] for table in results["tables"])), FIGURES, ("png", "svg")
+    ):
+        path = document.with_name(f"{document.name}_{slug(title)}_{name}.{kind}")
+        if path not in files:
+            path.unlink(missing_ok=True)
     return list(files)
 
 
@@ -79,11 +84,16 @@ def read_numbers(document: Path) -> dict[str, Any]:
         ValueError: it is damaged.
     """
     results = read_json(numbers_file(document))
-    known = {_name_of(step): step for step in results.pop("steps", [])}
+    steps = results.pop("steps", {})
     for run in runs_of(results):
         # Older reports have the whole in each run, and the oldest nothing.
-        made_from = run.get("made_from", {})
-        made_from |= {kind: known[name] for kind, name in made_from.items() if isinstance(name, str)}
+        for kind, name in run.get("made_from", {}).items():
+            if isinstance(name, str):
+                if name not in steps:
+                    raise ValueError(
+                        f"{numbers_file(document)} is damaged: there is no step {name!r}, from which a run was made"
+                    )
+                run["made_from"][kind] = steps[name]
     return results
 
 
@@ -94,20 +104,25 @@ def _one_a_line(results: Mapping[str, Any]) -> str:
     """
     dump = json.JSONEncoder(separators=(",", ":")).encode
     told = _short(results)
-    known: dict[str, Any] = {}
+    steps: dict[str, Any] = {}
     for run in runs_of(told):
-        made_from = run.get("made_from", {})
-        known |= {_name_of(step): step for step in made_from.values()}
-        made_from |= {kind: _name_of(step) for kind, step in made_from.items()}
-    told["steps"] = [known[name] for name in sorted(known)]
-    lists = {key: ",\n".join(map(dump, told.pop(key, []))) for key in ("tables", "runs", "steps")}
-    lines = "".join(f',"{key}":[\n{each}\n]' if each else f',"{key}":[]' for key, each in lists.items())
-    return f"{dump(told)[:-1]}{lines}}}"
+        for kind, step in run.get("made_from", {}).items():
+            # Of all that is known of it: the same result may have been made on two machines.
+            name = digest_json(step)[:SHORT]
+            steps[name] = step
+            run["made_from"][kind] = name
+    lines = {
+        "tables": _lines("[]", map(dump, told.pop("tables", []))),
+        "runs": _lines("[]", map(dump, told.pop("runs", []))),
+        "steps": _lines("{}", (f"{dump(name)}:{dump(steps[name])}" for name in sorted(steps))),
+    }
+    return f"{dump(told)[:-1]}{''.join(f',"{key}":{text}' for key, text in lines.items())}}}"
 
 
-def _name_of(step: Mapping[str, Any]) -> str:
-    """Of a recording or a training: the same recipe may give another result on another machine."""
-    return f"{step['recipe']} {step['digest']}"
+def _lines(brackets: str, members: Iterable[str]) -> str:
+    """A list or an object with a line for each member."""
+    inner = ",\n".join(members)
+    return f"{brackets[0]}\n{inner}\n{brackets[1]}" if inner else brackets
 
 
 def _short(value: Any) -> Any:
@@ -141,7 +156,9 @@ def _few_colours(picture: io.BytesIO) -> bytes:
     from PIL import Image
 
     buffer = io.BytesIO()
-    image = Image.open(picture).convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE)
+    image = Image.open(picture).convert("RGB")
+    # The median cut, which is the default, turns colours of a few pixels, as marks have them, into grey.
+    image = image.quantize(_COLOURS, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     image.save(buffer, format="png", optimize=True)
     return buffer.getvalue()
 

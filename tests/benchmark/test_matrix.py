@@ -23,9 +23,9 @@ from hdril.benchmark import steps as steps_module
 from hdril.benchmark.calibrate import Speed
 from hdril.benchmark.check import check, check_held_out
 from hdril.benchmark.engine import in_order
-from hdril.benchmark.figures import figures
+from hdril.benchmark.figures import COLOURS, figures
 from hdril.benchmark.matrix import Matrix, all_steps, drawn_data, rows, steps
-from hdril.benchmark.page import read_numbers, write_report
+from hdril.benchmark.page import read_numbers, write_numbers, write_report
 from hdril.benchmark.perform import Assignment
 from hdril.benchmark.report import markdown
 from hdril.benchmark.results import collect
@@ -1371,9 +1371,9 @@ def test_the_page_holds_all_that_it_shows(tmp_path: Path) -> None:
     table, *rest = json.loads(data)["tables"]
     assert (len(data.splitlines()), rest) == (4 + len(json.loads(data)["steps"]), []), "one table and one step a line"
     made_from = [run["made_from"] for row in table["rows"] for runs in row["cells"].values() for run in runs]
-    told = [f"{step['recipe']} {step['digest']}" for step in json.loads(data)["steps"]]
+    told = list(json.loads(data)["steps"])
     assert {name for made in made_from for name in made.values()} == set(told)
-    assert len(told) == len(set(told)), "each step is listed once"
+    assert told == sorted(told)
     write_report(tmp_path / "none/test", results | {"tables": []})
     assert json.loads((tmp_path / "none/test.json").read_text())["tables"] == []
     assert "![Lift](test_lift_success.png)" in text
@@ -1386,7 +1386,8 @@ def test_the_page_holds_all_that_it_shows(tmp_path: Path) -> None:
             assert Image.open(tmp_path / "out" / name).mode == "P", "few colours, few bytes"
         else:
             drawn = (tmp_path / "out" / name).read_text()
-            assert not re.search(r"\n\s|\d\.\d{3}[^<]*>", drawn), "few digits, no indents"
+            assert not re.search(r"\n\s|\d\.\d{3}[^<]*>|Bitstream Vera", drawn), "few digits, no indents, one font"
+            assert re.search(r"\d\.\d{2}[^\d<]*>", drawn), "hundredths of a point"
     parts = re.findall(r' id="([^"]+)"', page)
     assert len(parts) == len(set(parts)), "names of parts are unique"
     assert set(re.findall(r'(?:xlink:href="|url\()#([^")]+)', page)) <= set(parts)
@@ -1418,22 +1419,70 @@ def test_words_in_a_figure_keep_their_digits(tmp_path: Path) -> None:
 
 
 def test_a_table_of_one_row_has_no_figure_of_its_success(tmp_path: Path) -> None:
-    def reported(name: str, change: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
+    def reported(name: str, policies: list[str]) -> dict[str, Any]:
+        def change(values: dict[str, Any]) -> None:
+            one_row(values)
+            values["tables"][0].update(policies=policies, against="")
+
         matrix, store = changed(change), Store(tmp_path / name)
         pretend(store, matrix, fails)
         return collect(matrix, store)
 
-    def single(values: dict[str, Any]) -> None:
-        one_row(values)
-        values["tables"][0].update(policies=["linear"], against="")
-
-    other = tmp_path / "test_lifting_success.png"
-    other.write_bytes(b"of a table with a longer title")
-    for found, drawn in ((reported("several", one_row), True), (reported("one", single), False)):
+    others = [tmp_path / f"test_lift_{name}.png" for name in ("lift_success", "notes", "success_2")]
+    for other in others:
+        other.write_bytes(b"of another report, or of a person")
+    for found, drawn in ((reported("two", ["linear", "hdril"]), True), (reported("one", ["linear"]), False)):
         write_report(tmp_path / "test", found)
-        assert (tmp_path / "test_lift_success.png").exists() == drawn, "an older figure is removed"
+        for kind in ("png", "svg"):
+            assert (tmp_path / f"test_lift_success.{kind}").exists() == drawn, "an older figure is removed"
         assert ("![Lift](test_lift_success.png)" in (tmp_path / "test.md").read_text()) == drawn
-    assert other.exists()
+    assert all(other.exists() for other in others)
+
+
+def test_a_figure_has_the_colours_that_people_can_tell_apart(tmp_path: Path) -> None:
+    matrix, store = changed(one_row), Store(tmp_path / "store")
+    pretend(store, matrix, fails)
+    results = collect(matrix, store)
+    (table,) = results["tables"]
+    (told,) = table["evaluations"].values()
+    table["evaluations"] = {f"evaluation {i}": told for i in range(4)}
+    for row in table["rows"]:
+        (runs,) = row["cells"].values()
+        row["cells"] = dict.fromkeys(table["evaluations"], runs)
+    write_report(tmp_path / "test", results)
+    picture = np.asarray(Image.open(tmp_path / "test_lift_success.png").convert("RGB"), dtype=int)
+    for colour in COLOURS[:4]:
+        wanted = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+        assert np.abs(picture - wanted).max(axis=-1).min() <= 3, colour
+
+
+def test_numbers_have_six_digits_and_a_line_for_each_run(tmp_path: Path) -> None:
+    runs: list[dict[str, Any]] = [
+        {"recipe": "one", "value": 1 / 3},
+        {"recipe": "two", "values": (1 / 3, 2, True, None)},
+    ]
+    write_numbers(tmp_path / "test", {"name": "test", "runs": runs})
+    assert (tmp_path / "test.json").read_text() == (
+        '{"name":"test","tables":[],"runs":[\n{"recipe":"one","value":0.333333},\n'
+        '{"recipe":"two","values":[0.333333,2,true,null]}\n],"steps":{}}'
+    )
+    assert runs[0]["value"] == 1 / 3
+
+
+def test_runs_that_two_machines_made_from_the_same_keep_what_is_told_of_each(tmp_path: Path) -> None:
+    trained: dict[str, Any] = {"recipe": "recipe", "digest": "digest", "seconds": 10.0, "machine": "fast"}
+    runs: list[dict[str, Any]] = [
+        {"recipe": "one", "made_from": {"train": trained}},
+        {"recipe": "two", "made_from": {"train": trained}},
+        {"recipe": "three", "made_from": {"train": trained | {"seconds": 20.0, "machine": "slow"}}},
+    ]
+    write_numbers(tmp_path / "test", {"name": "test", "runs": runs})
+    assert read_numbers(tmp_path / "test")["runs"] == runs
+    path = tmp_path / "test.json"
+    assert len(json.loads(path.read_text())["steps"]) == 2
+    path.write_text(re.sub(r'"steps":\{\n.*,\n', '"steps":{\n', path.read_text()))
+    with pytest.raises(ValueError, match=r"test\.json is damaged: there is no step"):
+        read_numbers(tmp_path / "test")
 
 
 def test_reports_that_hold_each_step_in_each_run_are_read(tmp_path: Path) -> None:
