@@ -93,7 +93,7 @@ def read_numbers(document: Path) -> dict[str, Any]:
                     raise ValueError(
                         f"{numbers_file(document)} is damaged: there is no step {name!r}, from which a run was made"
                     )
-                run["made_from"][kind] = steps[name]
+                run["made_from"][kind] = dict(steps[name])
     return results
 
 

@@ -1477,7 +1477,9 @@ def test_runs_that_two_machines_made_from_the_same_keep_what_is_told_of_each(tmp
         {"recipe": "three", "made_from": {"train": trained | {"seconds": 20.0, "machine": "slow"}}},
     ]
     write_numbers(tmp_path / "test", {"name": "test", "runs": runs})
-    assert read_numbers(tmp_path / "test")["runs"] == runs
+    found = read_numbers(tmp_path / "test")["runs"]
+    assert found == runs
+    assert found[0]["made_from"]["train"] is not found[1]["made_from"]["train"], "a change of one run is of that one"
     path = tmp_path / "test.json"
     assert len(json.loads(path.read_text())["steps"]) == 2
     path.write_text(re.sub(r'"steps":\{\n.*,\n', '"steps":{\n', path.read_text()))
