@@ -129,7 +129,7 @@ def _success(table: Mapping[str, Any]) -> Figure:
     from matplotlib.figure import Figure
 
     rows, names = table["rows"], list(table["evaluations"])
-    figure = Figure(figsize=(7.5, 1.3 + 0.22 * len(rows) * len(names)), layout="constrained")
+    figure = Figure(figsize=(7.5, 1.3 + 0.22 * (len(rows) + 1) * len(names)), layout="constrained")
     axes = figure.subplots()
     labels = []
     for place, row in enumerate(rows):
@@ -141,7 +141,8 @@ def _success(table: Mapping[str, Any]) -> Figure:
     # The first row on top, and room beside the outermost marks.
     axes.set(xlim=(-2, 102), ylim=(len(rows) - 0.5, -0.5), xlabel="success, %", title=table["title"])
     axes.grid(axis="x", alpha=0.3)
-    axes.legend(loc="lower left", bbox_to_anchor=(1.0, 0.0), frameon=False)
+    # Below: beside the axes, long names of evaluations would leave them no width.
+    figure.legend(loc="outside lower center", frameon=False)
     return figure
 
 

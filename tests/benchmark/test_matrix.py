@@ -1439,13 +1439,13 @@ def test_a_table_of_one_row_has_no_figure_of_its_success(tmp_path: Path) -> None
     assert all(other.exists() for other in others)
 
 
-def test_a_figure_has_the_colours_that_people_can_tell_apart(tmp_path: Path) -> None:
+def test_a_figure_has_room_and_the_colours_that_people_can_tell_apart(tmp_path: Path) -> None:
     matrix, store = changed(one_row), Store(tmp_path / "store")
     pretend(store, matrix, fails)
     results = collect(matrix, store)
     (table,) = results["tables"]
     (told,) = table["evaluations"].values()
-    table["evaluations"] = {f"evaluation {i}": told for i in range(4)}
+    table["evaluations"] = {f"an evaluation with a long name, number {i}": told for i in range(4)}
     for row in table["rows"]:
         (runs,) = row["cells"].values()
         row["cells"] = dict.fromkeys(table["evaluations"], runs)
@@ -1454,6 +1454,9 @@ def test_a_figure_has_the_colours_that_people_can_tell_apart(tmp_path: Path) -> 
     for colour in COLOURS[:4]:
         wanted = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
         assert np.abs(picture - wanted).max(axis=-1).min() <= 3, colour
+    drawn = figures(table)["success"]
+    drawn.draw_without_rendering()
+    assert drawn.axes[0].get_position().width > 0.4, "names leave room for what they name"
 
 
 def test_numbers_have_six_digits_and_a_line_for_each_run(tmp_path: Path) -> None:
