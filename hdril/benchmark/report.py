@@ -9,7 +9,6 @@ from typing import Any
 
 from hdril.benchmark.matrix import BESIDE
 from hdril.benchmark.results import SIGNIFICANCE
-from hdril.benchmark.steps import Record
 from hdril.evaluation.statistics import TrainingSpread
 from hdril.markdown import table as markdown_table
 
@@ -327,15 +326,10 @@ def _commands(table: Mapping[str, Any]) -> str:
     """The commands under a table's numbers, once each, folded."""
     found: dict[str, None] = {}
     for row in table["rows"]:
-        spec = table["data"][row["data"]]
-        for command in row["training_commands"]:
-            record = Record(spec["task"], row["demonstrations"], spec["seed"], spec["perturb"], spec["stray"])
-            # Older reports did not keep this command.
-            found[row.get("record_command") or shlex.join(record.command(_folder(command, "--dataset.root="), {}))] = (
-                None
-            )
-            found[command] = None
-        found |= dict.fromkeys(run["command"] for runs in row["cells"].values() for run in runs)
+        runs = [run for cell in row["cells"].values() for run in cell]
+        for run in runs:
+            found |= dict.fromkeys(run["made_from"][kind]["command"] for kind in ("record", "train"))
+        found |= dict.fromkeys(run["command"] for run in runs)
     return "<details><summary>Commands of this table</summary>\n\n```\n" + "\n".join(found) + "\n```\n\n</details>"
 
 

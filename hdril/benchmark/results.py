@@ -233,8 +233,7 @@ def _row(row: Row, store: Store, kept: Kept) -> dict[str, Any]:
         name: [kept.get(store.recipe(step)) or run_of(step, store) for step in steps]
         for name, steps in row.evaluations.items()
     }
-    made_from = [run["made_from"] for run in next(iter(cells.values()))]
-    trained = [made["train"] for made in made_from]
+    trained = [run["made_from"]["train"] for run in next(iter(cells.values()))]
     return {
         "data": row.data,
         "policy": row.policy,
@@ -242,8 +241,6 @@ def _row(row: Row, store: Store, kept: Kept) -> dict[str, Any]:
         "minutes": row.minutes,
         "steps": trained[0]["steps"],
         "training_minutes": [round(training["seconds"] / 60.0, 1) for training in trained],
-        "record_command": made_from[0]["record"]["command"],
-        "training_commands": [training["command"] for training in trained],
         "cells": cells,
     }
 
